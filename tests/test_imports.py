@@ -212,7 +212,7 @@ def test_an_upward_import_is_found_wherever_it_hides(module: str, source: str) -
     [
         ("gsencoder.fusion.fuse", "from gsencoder.render.blend import blend\nfrom ..data import scenes\nimport torch"),
         ("gsencoder.data.scenes", "from gsencoder.data.splats.files import read_raw\nfrom .colmap import read"),
-        ("gsencoder.app.summary", "import gsencoder\nfrom gsencoder import __version__"),
+        ("gsencoder.app.output", "import gsencoder\nfrom gsencoder import __version__"),
     ],
 )
 def test_a_downward_import_is_left_alone(module: str, source: str) -> None:

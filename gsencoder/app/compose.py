@@ -30,7 +30,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from omegaconf import OmegaConf
 
@@ -43,14 +43,13 @@ from gsencoder.app.options import (
     Option,
     cached,
     describe,
-    describe_presets,
     field_types,
     join_list,
     member_name,
     near,
     options_by_key,
     options_of,
-    preset_node,
+    preset_values,
     section_classes,
     settings,
     typed,
@@ -58,6 +57,7 @@ from gsencoder.app.options import (
     wrong_value,
 )
 from gsencoder.core.errors import InputError, one_line
+from gsencoder.core.settings import shown_value
 
 EXPERIMENT = "experiment"
 """The group whose members set options of several sections; they are merged last, after the command's own defaults and
@@ -70,8 +70,7 @@ class Group:
 
     Attributes:
         key: the section, with a slash before a nested one; also the name of the folder of YAML files.
-        default: name of the member that is used by default.
-        members: the settings of the members that the dataclasses define, as plain dicts.
+        members: the settings of the members that the dataclasses define.
     """
 
     key: str
@@ -83,11 +82,17 @@ class Group:
 def groups_of(cls: type[CommonConfig]) -> tuple[Group, ...]:
     """The config groups of a command, in order of declaration, presets and experiments last."""
     groups = list(_section_groups(cls()))
-    presets = {name: {PRESET + LIKE_GROUP: name, **preset_node(cls, name)} for name in PRESETS}
-    groups.append(Group(key=PRESET, default=DEFAULT_PRESET, members=presets))
+    groups.append(Group(key=PRESET, default=DEFAULT_PRESET, members={name: _preset(cls, name) for name in PRESETS}))
     if cls.has_experiments:
         groups.append(Group(key=EXPERIMENT, default="none", members={"none": {}}))
     return tuple(groups)
+
+
+def _preset(cls: type[CommonConfig], name: str) -> dict[str, Any]:
+    node = OmegaConf.create({PRESET + LIKE_GROUP: name})
+    for key, value in preset_values(cls, name).items():
+        OmegaConf.update(node, key, value)
+    return cast(dict[str, Any], OmegaConf.to_container(node))
 
 
 def _section_groups(config: Any, prefix: str = "") -> Iterator[Group]:
@@ -107,8 +112,7 @@ def _section_groups(config: Any, prefix: str = "") -> Iterator[Group]:
 
 
 def store_settings(command: str, cls: type[CommonConfig]) -> None:
-    """Stores the defaults of a command and the members of its groups in Hydra's config store; earlier ones are
-    replaced."""
+    """Stores the defaults of a command and the members of its groups in Hydra's config store."""
     from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance()
@@ -134,12 +138,11 @@ def store_settings(command: str, cls: type[CommonConfig]) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """The options and choices of a command.
+    """The options of a command by full key, and its choices.
 
     Attributes:
-        options: by full key.
         members: for each key the members of a choice that have this option; empty if it always applies.
-        groups: the names of each choice's members, by the choice's key.
+        groups: the names of each choice's members.
         chosen: the default of each choice.
     """
 
@@ -181,35 +184,29 @@ def full_key(key: str, choices: Choices) -> str | None:
     keys = [*choices.options, *choices.groups]
     if key in keys or option_of_several(key, choices) is not None:
         return key
-    ends = [name for name in keys if re.split(r"[./]", name)[-1] == key]
+    depths = {name: len(parts) for name in keys if (parts := re.split(r"[./]", name))[-1] == key}
     # An option of a section within a section gives way to one that is less deep.
-    depths = [len(re.split(r"[./]", name)) for name in ends]
-    ends = [name for name, depth in zip(ends, depths, strict=True) if depth == min(depths)]
+    ends = [name for name, depth in depths.items() if depth == min(depths.values())]
     if len(ends) > 1:
         raise InputError(f"{key}: stands for more than one option; write {' or '.join(f'{end}=' for end in ends)}")
     return ends[0] if ends else None
 
 
-def check_options_of_one(texts: Mapping[str, str], choices: Choices) -> None:
-    """Checks that with several members of a choice no options are given for the only one."""
-    for key, value in texts.items():
-        several = choices.options[key].several if key in choices.options else ""
-        unused = [name for name in texts if name == several or name.startswith(f"{several}.")] if several else []
-        if unused:
-            option = unused[0].partition(".")[2]
-            hint = f"{key}.NAME.{option}=… is that of one of them" if option else f"leave out {several}= or {key}="
-            raise InputError(f"{unused[0]}: is for a single {several}, and {key}={value} gives several; {hint}")
-        if several and not value.strip("[] "):
-            raise InputError(f"{key}: expected one or more of {', '.join(choices.groups[several])}, got {value!r}")
+def check_member(key: str, member: str, choices: Choices, kind: str = "one") -> None:
+    """Checks that a choice has a member."""
+    names = choices.groups.get(key) or choices.groups[choices.options[key].several]
+    if member not in names:
+        raise InputError(f"{key}: expected {kind} of {', '.join(names)}, got {member!r}{near(member, names)}")
 
 
-def members_of(key: str, value: str, group: str, members: Sequence[str]) -> list[str]:
+def members_of(key: str, value: str, choices: Choices) -> list[str]:
     """Overrides that add several members of a choice, each below a name of its own."""
-    pairs = named_members(value)
+    pairs, group = named_members(value), choices.options[key].several
     names = [name for name, _ in pairs]
+    if not pairs:
+        raise InputError(f"{key}: expected one or more of {', '.join(choices.groups[group])}, got {value!r}")
     for name, member in pairs:
-        if member not in members:
-            raise InputError(f"{key}: expected some of {', '.join(members)}, got {member!r}{near(member, members)}")
+        check_member(key, member, choices, "some")
         if names.count(name) > 1:
             raise InputError(f"{key}: {name} is given twice; give other names, such as {name}_2:{member}")
         if not re.fullmatch(r"\w+", name, re.ASCII):
@@ -224,15 +221,17 @@ def named_members(value: str) -> list[tuple[str, str]]:
 
 
 def check_single(data: Mapping[str, Any], texts: Mapping[str, str], choices: Choices) -> None:
-    """Checks that nothing was given for a single member of a choice of which an experiment gives several."""
+    """Checks that nothing was given for a single member of a choice where the command line or an experiment gives
+    several."""
     for key, option in choices.options.items():
         single = option.several
         unused = [name for name in texts if single and (name == single or name.startswith(f"{single}."))]
-        if unused and data.get(key):
+        if unused and (key in texts or data.get(key)):
+            source = key if key in texts else EXPERIMENT
+            name = unused[0].partition(".")[2] or "OPTION"
             raise InputError(
-                f"{unused[0]}: is for a single {single}, and {EXPERIMENT}={texts.get(EXPERIMENT, '')} gives several, "
-                f"{', '.join(data[key])}; options of one of them are {key}.NAME.OPTION=…, others need another "
-                f"{EXPERIMENT}="
+                f"{unused[0]}: is for a single {single}, and {source}={texts.get(source, '')} gives several; leave it "
+                f"out, or write {key}.NAME.{name}=… for one of them"
             )
 
 
@@ -241,42 +240,38 @@ HYDRA_KEY = re.compile(r"\+{0,2}hydra[./]")
 
 
 def hydra_error(error: Exception, texts: Mapping[str, str], choices: Choices) -> str:
-    """The message of an error of Hydra; it is explained if an option belongs to a member that was not chosen, or to no
-    launcher, or if the launcher is not installed."""
-    launcher = re.search(r"Could not find 'hydra/launcher/([^']+)'", str(error))
-    if launcher:
+    """The message of an error of Hydra, explained where an option belongs to a member that was not chosen."""
+    text = " ".join(str(error).split())
+    if launcher := re.search(r"Could not find 'hydra/launcher/([^']+)'", text):
         return (
             f"hydra/launcher={launcher[1]}: no such launcher is installed; submitit_slurm and submitit_local come with "
             "pip install 'gsencoder[slurm]'"
         )
-    twice = re.search(r"(\w+)@(\w+)\.(\w+) appears more than once", str(error))
-    if twice:
+    if twice := re.search(r"(\w+)@(\w+)\.(\w+) appears more than once", text):
         return (
             f"{twice[2]}.{twice[3]}: is given by {EXPERIMENT}={texts.get(EXPERIMENT, '')} and once more; leave out "
             f"{twice[1]}=, since those of an experiment cannot be replaced, or leave out {EXPERIMENT}="
         )
-    absent = re.search(r"Could not find '(\w+)/([^']+)'", str(error))
-    if absent and absent[1] in choices.groups:
-        names = choices.groups[absent[1]]
-        return f"{absent[1]}: expected one of {', '.join(names)}, got {absent[2]!r}{near(absent[2], names)}"
-    match = re.search(r"Could not override '([^']+)'", str(error))
-    if match and match[1] in texts:
-        key = match[1]
-        if HYDRA_KEY.match(key):
-            return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
-        if key not in choices.options:
-            section, _, name = key.rpartition(".")[0].partition(".")
-            member = dict(named_members(texts.get(section, ""))).get(name)
-            if member is None:
-                return f"{key}: there is no {name} among the {section} of this run; {section}= names them"
-            owners = choices.members.get(f"{section.removesuffix('s')}.{key.rpartition('.')[2]}")
-            whose = " and ".join(owners) if owners else "none of them"
-            return f"{key}: is an option of {whose}, and {name} is {section.removesuffix('s')}={member}"
-        section = key.rpartition(".")[0]
+    if (absent := re.search(r"Could not find '(\w+)/([^']+)'", text)) and absent[1] in choices.groups:
+        check_member(absent[1], absent[2], choices)
+    match = re.search(r"Could not override '([^']+)'", text)
+    key = match[1] if match else ""
+    if key not in texts:
+        return text
+    if HYDRA_KEY.match(key):
+        return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
+    section = key.rpartition(".")[0]
+    if key in choices.options:
         group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
         now = texts.get(group, choices.chosen.get(group))
         return f"{key}: is an option of {' and '.join(choices.members[key]) or section}, and {group} is {now}"
-    return " ".join(str(error).split())
+    field, _, name = section.partition(".")
+    single = field.removesuffix("s")
+    member = dict(named_members(texts.get(field, ""))).get(name)
+    if member is None:
+        return f"{key}: there is no {name} among the {field} of this run; {field}= names them"
+    owners = choices.members.get(f"{single}.{key.rpartition('.')[2]}", ())
+    return f"{key}: is an option of {' and '.join(owners)}, and {name} is {single}={member}"
 
 
 Config = TypeVar("Config", bound=CommonConfig)
@@ -383,25 +378,21 @@ def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False
 
     parser = OverridesParser.create()
     hydra_overrides = []
-    check_options_of_one(texts, choices)
+    check_single({}, texts, choices)
     for key, value in texts.items():
         option = choices.options.get(key) or option_of_several(key, choices)
         if option is not None and option.several:
-            hydra_overrides += members_of(key, value, option.several, choices.groups[option.several])
+            hydra_overrides += members_of(key, value, choices)
             continue
         text = value
         if key in choices.groups:
-            names = choices.groups[key]
             # Hydra merges several experiments in the order in which they are listed.
             several = re.fullmatch(r"\[(.*)\]", value) if key == EXPERIMENT else None
-            secret = any(name.startswith(f"{key}.") and each.secret for name, each in choices.options.items())
             members = several[1].replace(" ", "").split(",") if several else [value]
             if repeated := [name for name in members if members.count(name) > 1]:
                 raise InputError(f"{key}: {repeated[0]} is given twice in {value}; give it once")
-            unknown = [name for name in members if name not in names]
-            if unknown and (secret or not sweep):
-                actual = "" if secret else f", got {unknown[0]!r}{near(unknown[0], names)}"
-                raise InputError(f"{key}: expected one of {', '.join(names)}{actual}")
+            for member in members if not sweep else ():
+                check_member(key, member, choices)
         elif option is not None and option.kind != "value":
             if not (sweep and SWEPT_TEXT.fullmatch(value)):
                 # Users of Hydra write brackets around a list; text may begin with one, names do not.
@@ -409,7 +400,8 @@ def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False
                 text = encode_text(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
         elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
             text = f"[{value}]"
-        name = option.hydra_key if option is not None and option.like_group and key not in choices.groups else key
+        # An option of several members has its key, whatever option of a single one it stands for.
+        name = choices.options[key].hydra_key if key in choices.options and key not in choices.groups else key
         try:
             parsed = parser.parse_override(f"{name}={text}")
             swept = parsed.is_sweep_override()
@@ -450,11 +442,9 @@ def compose(
 
 def plain_settings(composed: Any) -> dict[str, Any]:
     """The composed settings as plain dicts, lists and scalars, without Hydra's own."""
-
-    settings = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
-    data = OmegaConf.to_container(settings, resolve=True)
-    assert isinstance(data, dict)
-    return {str(key).removesuffix(LIKE_GROUP): value for key, value in data.items()}
+    own = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
+    data = cast(dict[str, Any], OmegaConf.to_container(own, resolve=True))
+    return {key.removesuffix(LIKE_GROUP): value for key, value in data.items()}
 
 
 RULES = (
@@ -465,13 +455,11 @@ RULES = (
 
 
 def _shown(value: Any) -> str:
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, (list, tuple)):
-        return join_list(map(str, value)) if value else "none"
-    return str(value) if value != "" else "empty"
+    if value == "":
+        return "empty"
+    if isinstance(value, tuple):
+        return join_list(map(str, value)) or "none"
+    return str(value).lower() if isinstance(value, bool) or value is None else str(value)
 
 
 def _entry(head: str, text: str, width: int) -> list[str]:
@@ -482,11 +470,6 @@ def _entry(head: str, text: str, width: int) -> list[str]:
 def _option(option: Option, width: int) -> list[str]:
     kind = option.metavar or describe(option.annotation)
     return _entry(f"{option.key}={kind}", f"{option.help} [{_shown(option.default)}]", width)
-
-
-def choice_help(cls: type[CommonConfig], group: str) -> str:
-    """What a command says of one of its choices; empty for most, whose members say it."""
-    return str(next((each.metadata.get("help", "") for each in fields(cls) if each.name == group), ""))
 
 
 def command_help(
@@ -506,11 +489,14 @@ def command_help(
     if groups:
         lines += ["", "choices:"]
         for group, members in groups.items():
-            meaning = f"{choice_help(cls, group)} [{_shown(choices.chosen[group])}]".strip()
+            text = next((str(each.metadata.get("help", "")) for each in fields(cls) if each.name == group), "")
+            meaning = f"{text} [{_shown(choices.chosen[group])}]".strip()
             lines += _entry(f"{group}={'|'.join(members)}", meaning, width)
     lines += ["", f"presets [{DEFAULT_PRESET}]:"]
-    for preset, changes in describe_presets(cls).items():
-        lines += _entry(f"{PRESET}={preset}", changes, width)
+    for preset in PRESETS:
+        changes = ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, preset).items())
+        nothing = "the defaults" if preset == DEFAULT_PRESET else "changes nothing in this command"
+        lines += _entry(f"{PRESET}={preset}", changes or nothing, width)
     lines += ["", "settings [default]:"]
     for option in options:
         if option.key != "paths" and not option.member and option.key not in choices.groups:
@@ -568,9 +554,7 @@ def run_many(
     """Calls `run(settings)` for every combination of the values given and returns the exit code: 2 if one failed.
 
     Args:
-        words: the command line after the command.
         run: does one run, prints its error and returns it; an empty text for none.
-        conf: folder of YAML files; None = the package's.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException

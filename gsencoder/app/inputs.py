@@ -3,11 +3,11 @@
 from pathlib import Path
 
 from gsencoder.app.run import Run
-from gsencoder.app.scenes import with_reported_up
 from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.up import with_up
 from gsencoder.fusion.cameras import INSIDE, CamerasOfSplat, with_views
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.render import BlendConfig
@@ -26,19 +26,8 @@ def load_fusable(
     blend: BlendConfig,
     labels: bool,
 ) -> Scene:
-    """Loads a scene with Gaussians and views: seeds if it has no splat, orbit cameras if it has no views.
-
-    Args:
-        path: of the scene.
-        run: takes the seconds of the steps.
-        splat: file of the Gaussians, or empty.
-        data: how the scene is read.
-        seeds: how Gaussians are made.
-        orbits: largest number of cameras placed in a bare splat.
-        cameras: where they stand.
-        blend: how a bare splat is rendered.
-        labels: whether a teacher needs labels, which a bare splat has not.
-    """
+    """Loads a scene with Gaussians and views: seeds if it has no splat, and at most `orbits` cameras, which `blend`
+    renders, if it has no views. `labels` says whether a teacher needs labels, which a bare splat has not."""
     with run.step("load"):
         scene = load_scene(path, splat=splat or None, options=data)
     with run.step("check"):
@@ -52,7 +41,8 @@ def load_fusable(
     if scene.gaussians is None:
         with run.step("seeds"):
             scene = with_gaussians(scene, seeds, track=run.track)
-    scene = with_reported_up(scene, run)
+    scene, up = with_up(scene)
+    run.report_up(scene.name, up)
     if scene.views is not None:
         return scene
     with run.step("cameras"):

@@ -22,21 +22,15 @@ from functools import partial
 from typing import Any
 
 import gsencoder
-from gsencoder.app.options import CommonConfig, near, without_value
+from gsencoder.app.options import CommonConfig, check_required, near, settings, without_value
 from gsencoder.core.errors import InputError, SceneWarning, clipped, one_line, printable
 from gsencoder.core.process import Stopped, refuse_several, stop_of, stopping_signals
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command of the command line.
-
-    Attributes:
-        name: as the user types it; `gsencoder.app.commands.NAME` is its module.
-        config: the name of the settings class in that module.
-        help: its purpose, one line.
-        several: whether several processes of one launcher (torchrun, SLURM) can run it together.
-    """
+    """A command: the module `gsencoder.app.commands.NAME`, its settings class, its purpose, and whether several
+    processes of one launcher (torchrun, SLURM) can run it together."""
 
     name: str
     config: str
@@ -112,8 +106,6 @@ TOO_LARGE = re.compile(
     re.IGNORECASE,
 )
 """Words of the errors of torch, numpy and Python for sizes that cannot be allocated or counted."""
-LARGE = 10**7
-"""Settings from here on are named where memory lacks."""
 SHORT = {"-h": "--help", "-m": "--multirun"}
 
 
@@ -138,14 +130,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
             return code
     except InputError as error:
-        _report("error", str(error), debug)
-        _report_notes(error)
+        _report("error", error, debug)
         return 2
     except (KeyboardInterrupt, Stopped, SystemError) as error:
         stop = stop_of(error)
         if stop is None:
             raise
-        return _stopped(stop, debug)
+        number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
+        if isinstance(stop, Stopped):
+            _report("stopped", stop, debug, signal.Signals(number).name)
+        else:
+            _report("interrupted", stop, debug)
+        return 128 + number
     except BrokenPipeError:
         _discard_stdout()
         return 1
@@ -153,8 +149,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         line = _fault_of_system(error)
         if line is None:
             raise
-        _report("error", line, debug)
-        _report_notes(error)
+        _report("error", error, debug, line)
         if error.filename is None:
             _discard_stdout()
         return 2
@@ -177,7 +172,7 @@ def _fault_of_system(error: OSError) -> str | None:
 
 
 @contextmanager
-def _impossible_sizes(values: Any) -> Iterator[None]:
+def _impossible_sizes() -> Iterator[None]:
     """Turns the errors of sizes that no memory holds, and of links to themselves, into one line."""
     try:
         yield
@@ -187,38 +182,20 @@ def _impossible_sizes(values: Any) -> Iterator[None]:
             raise InputError(f"{text.removeprefix('Symlink loop from ')}: is a link that leads to itself") from error
         if not isinstance(error, MemoryError) and not TOO_LARGE.search(text):
             raise
-        large = ", ".join(_large_numbers("", values))
         raise InputError(
-            f"{f'{large}: ' if large else ''}the machine has not enough memory for a size in the settings or the "
-            f"input ({text[:200]}); give smaller numbers, or less input"
+            f"the machine has not enough memory for a size in the settings or the input ({text[:200]}); give smaller "
+            "numbers, or less input"
         ) from error
 
 
-def _large_numbers(key: str, value: Any) -> Iterator[str]:
-    """The settings that are large numbers, as they are typed."""
-    if isinstance(value, dict):
-        for name, each in value.items():
-            yield from _large_numbers(f"{key}.{name}" if key else name, each)
-    elif any(type(each) is int and abs(each) >= LARGE for each in (value if isinstance(value, list) else [value])):
-        yield f"{key}={value}"
-
-
-def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:
-    number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
-    _report(*(("stopped", signal.Signals(number).name) if isinstance(stop, Stopped) else ("interrupted", "")), debug)
-    _report_notes(stop)
-    return 128 + number
-
-
-def _report(kind: str, message: str, debug: bool) -> None:
+def _report(kind: str, error: BaseException, debug: bool, message: str = "") -> None:
+    """Prints an error with its notes; `message` stands for the text of one that is not ours."""
     if debug:
         # It may contain messages of other programs and of servers.
         for line in traceback.format_exc().splitlines():
             print(printable(clipped(line)), file=sys.stderr)
+    message = message or str(error)
     print(f"{kind}: {one_line(message)}" if message else kind, file=sys.stderr)
-
-
-def _report_notes(error: BaseException) -> None:
     for note in getattr(error, "__notes__", ()):
         print(f"note: {one_line(note)}", file=sys.stderr)
 
@@ -259,20 +236,15 @@ def _dispatch(words: Sequence[str], began: float) -> int:
         raise InputError(f"{bare_name}: no such command{near(bare_name, COMMANDS)} (gsencoder --help lists them)")
     command = COMMANDS[name]
     cls, _ = command.load()
-    if "--help" in flags:
-        from gsencoder.app.compose import command_help
+    from gsencoder.app.compose import command_help, compose, run_many
 
+    if "--help" in flags:
         print(command_help(command.name, command.help, cls, FLAGS))
         return 0
     if "--multirun" in flags:
         if "--cfg" in flags:
             raise InputError("--cfg: shows one run; leave out -m")
-        from gsencoder.app.compose import run_many
-
         return run_many(name, cls, words, partial(_run_one, command, debug="--debug" in flags))
-    from gsencoder.app.compose import compose
-    from gsencoder.app.options import settings
-
     config = compose(name, cls, words)
     if "--cfg" in flags:
         from omegaconf import OmegaConf
@@ -285,7 +257,6 @@ def _dispatch(words: Sequence[str], began: float) -> int:
 
 def _run(command: Command, config: Any, debug: bool, began: float | None = None) -> None:
     """Runs a command; what it took to load it counts from `began`."""
-    from gsencoder.app.options import check_required
     from gsencoder.app.output import refuse_to_replace_inputs
     from gsencoder.app.run import Run
 
@@ -296,18 +267,17 @@ def _run(command: Command, config: Any, debug: bool, began: float | None = None)
     check_required(cls, config)
     run = Run(command.name, config, began)
     refuse_to_replace_inputs(config.out, run.settings)
-    with _collected_warnings(run.add_warning, debug), _impossible_sizes(run.settings):
+    with _collected_warnings(run.add_warning, debug), _impossible_sizes():
         run_command(config, run)
 
 
 def _run_one(command: Command, config: Any, debug: bool) -> str:
-    """Runs one of several runs; its error is printed and returned, with those of its scenes, and the others
-    continue."""
+    """Runs one of several runs; its error is printed and returned, with those of its scenes."""
     try:
         _run(command, config, debug)
     except InputError as error:
         message = f"{config.out}: {error}"
-        _report("error", message, debug)
+        _report("error", error, debug, message)
         # Whoever started the run in another process has not seen them.
         return "\n".join((message, *getattr(error, "reasons", ())))
     return ""

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_limits, option, shown_value, value_at
+from gsencoder.core.settings import check_limits, option, value_at
 
 Kind = Literal["text", "list", "value"]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -36,53 +36,64 @@ def cached(function: Function) -> Function:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
-    """An option of a command, as declared by a dataclass.
+    """An option of a command.
 
     Attributes:
         key: its full name, with dots between sections.
         annotation: its type.
-        default: its default.
-        help: its meaning, one line.
-        metavar: placeholder of its value in the help.
-        required: whether the command can run without it.
         member: the member of a choice that it belongs to, such as "teacher=onnx"; empty if it always applies.
-        kind: "text" and "list" (of text) are taken literally; "value" is parsed.
-        secret: its value is never shown or written.
-        several: the choice of which it takes several members, by name; empty for other options.
-        names: it is a list of names, around which users of Hydra may write brackets.
-        like_group: its name is that of a choice of other commands, for which Hydra would take it.
+        metadata: of its field; see the head of this module.
     """
 
     key: str
     annotation: Any
     default: Any
-    help: str
-    metavar: str
-    required: bool
     member: str
-    kind: Kind
-    secret: bool = False
-    several: str = ""
-    names: bool = False
-    like_group: bool = False
+    metadata: Mapping[str, Any]
+
+    @property
+    def help(self) -> str:
+        return str(self.metadata.get("help", ""))
+
+    @property
+    def metavar(self) -> str:
+        return str(self.metadata.get("metavar", ""))
+
+    @property
+    def secret(self) -> bool:
+        return bool(self.metadata.get("secret"))
+
+    @property
+    def several(self) -> str:
+        """The choice of which it takes several members, by name; empty for other options."""
+        return str(self.metadata.get("several", ""))
+
+    @property
+    def names(self) -> bool:
+        """Whether it is a list of words, around which users of Hydra may write brackets."""
+        items = list_items(self.annotation)
+        return bool(self.metadata.get("names")) or (len(items) == 1 and _is_word(items[0]))
+
+    @property
+    def kind(self) -> Kind:
+        """Whether its value is taken literally ("text", "list" of text) or parsed by Hydra ("value")."""
+        return kind_of(self.annotation)
 
     @property
     def hydra_key(self) -> str:
         """Its name in the settings that Hydra composes."""
-        return self.key + LIKE_GROUP if self.like_group else self.key
+        return self.key + LIKE_GROUP if self.metadata.get("like_group") else self.key
 
 
 LIKE_GROUP = "__option"
 """What stands after the name of an option in Hydra's settings where a choice of other commands has that name."""
-MAX_WORD = 200
-"""Number of characters of a word of the command line that an error repeats."""
 
 
 def without_value(word: str) -> str:
     """A word that is not an option, for an error message, without its value, which may be a misspelled option's
     secret."""
     key, equals, _ = word.partition("=")
-    return key[:MAX_WORD] + ("=…" if equals else "")
+    return key[:200] + ("=…" if equals else "")
 
 
 def near(word: str, names: Iterable[str]) -> str:
@@ -103,33 +114,25 @@ def union_members(annotation: Any) -> tuple[Any, ...]:
     return (annotation,)
 
 
-def allows_none(annotation: Any) -> bool:
-    """Whether a type is a union with None."""
-    return get_origin(annotation) in (Union, types.UnionType) and type(None) in get_args(annotation)
-
-
 def _is_word(annotation: Any) -> bool:
     return get_origin(annotation) is Literal and all(isinstance(value, str) for value in get_args(annotation))
 
 
+def list_items(annotation: Any) -> tuple[Any, ...]:
+    """The type of the items of a list of any length, alone in a tuple; empty for other types."""
+    items = get_args(annotation)
+    return items[:1] if get_origin(annotation) is tuple and items[1:] == (Ellipsis,) else ()
+
+
 def kind_of(annotation: Any) -> Kind:
-    """Whether the value of an option is taken literally ("text", "list") or parsed by Hydra ("value")."""
+    """The kind of an option of a type; see `Option.kind`."""
     members = union_members(annotation)
     if all(member in (str, Path) for member in members):
         return "text"
-    if get_origin(annotation) is Mapping:
-        return "list"
-    if len(members) == 1 and get_origin(members[0]) is tuple:
-        items = get_args(members[0])
-        if len(items) == 2 and items[1] is Ellipsis:
-            return "list" if items[0] in (str, Path) or _is_word(items[0]) else "value"
-    return "value"
-
-
-def is_list_of_words(annotation: Any) -> bool:
-    """Whether an option is a list of words from a closed set, without brackets, commas or blanks."""
-    items = get_args(annotation)
-    return get_origin(annotation) is tuple and len(items) == 2 and items[1] is Ellipsis and _is_word(items[0])
+    items = list_items(members[0]) if len(members) == 1 else ()
+    return (
+        "list" if get_origin(annotation) is Mapping or any(i in (str, Path) or _is_word(i) for i in items) else "value"
+    )
 
 
 def describe(annotation: Any) -> str:
@@ -141,7 +144,7 @@ def describe(annotation: Any) -> str:
         items = get_args(member)
         if get_origin(member) is Literal:
             words.append(f"{'one of ' if len(items) > 1 else ''}{', '.join(map(str, items))}")
-        elif get_origin(member) is tuple and len(items) == 2 and items[1] is Ellipsis:
+        elif list_items(member):
             words.append(f"a list, each {describe(items[0])}")
         elif get_origin(member) is Mapping:
             words.append("a list of names")
@@ -149,46 +152,19 @@ def describe(annotation: Any) -> str:
             words.append(f"a list of {len(items)} ({', '.join(describe(item) for item in items)})")
         else:
             words.append(names.get(member, getattr(member, "__name__", str(member))))
-    if allows_none(annotation):
+    if type(None) in get_args(annotation):
         words.append("null")
     return " or ".join(words)
 
 
 def split_list(text: str) -> tuple[str, ...]:
-    """Splits a list of text: commas separate items, `\\,` is a comma, and a backslash elsewhere is literal.
-
-    Before a comma, two backslashes are one (`\\\\,` is a backslash and a separator), so that every list can be written.
-    Blanks belong to the items; the empty text is the empty list.
-    """
-    items, current, index = [], "", 0
-    while index < len(text):
-        run = len(text) - index - len(text[index:].lstrip("\\"))
-        if text[index + run : index + run + 1] == ",":
-            current += "\\" * (run // 2)
-            if run % 2:
-                current += ","
-            else:
-                items.append(current)
-                current = ""
-            index += run + 1
-        else:
-            step = max(run, 1)
-            current += text[index : index + step]
-            index += step
-    return (*items, current) if text else ()
+    """Splits a list of text: commas separate items, `\\,` is a comma; the empty text is the empty list."""
+    return tuple(item.replace("\\,", ",") for item in re.split(r"(?<!\\),", text)) if text else ()
 
 
 def join_list(items: Iterable[str]) -> str:
-    """The text that `split_list` splits into these items (a single empty item cannot be written)."""
-    parts = []
-    for number, item in enumerate(items := tuple(items)):
-        pieces = item.split(",")
-        for index, piece in enumerate(pieces):
-            if index < len(pieces) - 1 or number < len(items) - 1:
-                piece += "\\" * (len(piece) - len(piece.rstrip("\\")))
-            pieces[index] = piece
-        parts.append("\\,".join(pieces))
-    return ",".join(parts)
+    """The text that `split_list` splits into these items."""
+    return ",".join(item.replace(",", "\\,") for item in items)
 
 
 @cached
@@ -220,12 +196,8 @@ def _default(item: Any) -> Any:
 
 
 def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = None) -> list[Option]:
-    """Every option of a settings class, sections included, in order of declaration.
-
-    Args:
-        member: the member of a choice that the class is.
-        defaults: an instance whose values are the defaults, as those of a section are; None = those of the class.
-    """
+    """Every option of a settings class, sections included, in order of declaration; `defaults` is an instance whose
+    values are the defaults."""
     options: list[Option] = []
     annotations = field_types(cls)
     for item in fields(cls):
@@ -238,20 +210,7 @@ def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = No
                 options += options_of(section, key + ".", owner, default if isinstance(default, section) else None)
         elif not (item.name == "name" and get_origin(annotation) is Literal and len(get_args(annotation)) == 1):
             options.append(
-                Option(
-                    key=key,
-                    annotation=annotation,
-                    default=default,
-                    help=item.metadata.get("help", ""),
-                    metavar=item.metadata.get("metavar", ""),
-                    required=item.metadata.get("required", False),
-                    member=member,
-                    kind=kind_of(annotation),
-                    secret=item.metadata.get("secret", False),
-                    several=item.metadata.get("several", ""),
-                    names=item.metadata.get("names", False) or is_list_of_words(annotation),
-                    like_group=item.metadata.get("like_group", False),
-                )
+                Option(key=key, annotation=annotation, default=default, member=member, metadata=item.metadata)
             )
     return options
 
@@ -269,23 +228,14 @@ def wrong_value(option: Option, value: Any) -> str:
     """The message for a value of the wrong type."""
     if isinstance(value, (list, tuple)) and option.kind == "list":
         value = join_list(map(str, value))
-    allowed = [str(word) for word in _words(option.annotation)]
-    hint = near(str(value), allowed) if allowed else ""
-    is_list = any(get_origin(member) is tuple for member in union_members(option.annotation))
+    members = union_members(option.annotation)
+    words = [each for member in members for each in (member, *list_items(member)) if get_origin(each) is Literal]
+    hint = near(str(value), [str(word) for each in words for word in get_args(each)])
+    is_list = any(get_origin(member) is tuple for member in members)
     if is_list and option.kind == "value" and isinstance(value, str) and "," in value:
         hint = f"; a list of numbers stands in brackets: {option.key}=[{value}]"
     meaning = f" ({option.help})" if option.help and not hint else ""
     return f"{option.key}: expected {describe(option.annotation)}, got {value!r}{hint}{meaning}"
-
-
-def _words(annotation: Any) -> tuple[Any, ...]:
-    words: tuple[Any, ...] = ()
-    for member in union_members(annotation):
-        if get_origin(member) is Literal:
-            words += get_args(member)
-        elif get_origin(member) is tuple:
-            words += tuple(word for item in get_args(member) if item is not Ellipsis for word in _words(item))
-    return words
 
 
 Preset = Literal["fast", "balanced", "exact"]
@@ -323,32 +273,7 @@ def preset_values(cls: type, preset: str) -> dict[str, Any]:
     return {key: value for key, value in PRESETS[preset].items() if key in options_by_key(cls)}
 
 
-def preset_node(cls: type, preset: str) -> dict[str, Any]:
-    """The same as nested settings."""
-    node: dict[str, Any] = {}
-    for key, value in preset_values(cls, preset).items():
-        *sections, name = key.split(".")
-        inner = node
-        for section in sections:
-            inner = inner.setdefault(section, {})
-        inner[name] = value
-    return node
-
-
-def describe_presets(cls: type) -> Mapping[str, str]:
-    """What each preset changes in a command, in words."""
-    changes = {
-        preset: ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, preset).items())
-        for preset in PRESETS
-    }
-    return {name: text or "changes nothing in this command" for name, text in changes.items()} | {
-        DEFAULT_PRESET: "the defaults"
-    }
-
-
 T = TypeVar("T")
-
-NOT_FINITE = "nan is not a finite number"
 
 HIDDEN = "(not shown)"
 """Shown and written in place of the value of a secret option."""
@@ -418,13 +343,12 @@ class QueriesConfig(FeaturesConfig):
     queries: str = option("", "a text file with one query a line")
 
 
-def _strict(target: type, accepted: tuple[type, ...]) -> Any:
-    """A dacite hook that converts values of the accepted types to `target`, and refuses all others."""
+def _number(target: type, accepted: tuple[type, ...]) -> Any:
+    """A dacite hook that converts numbers of the accepted types to `target`, and refuses all else, and NaN."""
     from dacite.exceptions import WrongTypeError
 
     def convert(value: Any) -> Any:
-        # NaN passes here, for `typed` to say what the class expects of it.
-        if not isinstance(value, accepted) or isinstance(value, bool):
+        if not isinstance(value, accepted) or isinstance(value, bool) or value != value:
             raise WrongTypeError(field_type=target, value=value)
         return target(value)
 
@@ -440,7 +364,7 @@ def _prepare(value: Any, annotation: Any) -> Any:
     members = union_members(annotation)
     if all(get_origin(member) is tuple for member in members) and not isinstance(value, (list, tuple, dict)):
         return (value,)
-    return None if value == "" and Path in members and allows_none(annotation) else value
+    return None if value == "" and Path in members and type(None) in get_args(annotation) else value
 
 
 def _section(annotation: Any, value: Any, key: str) -> Any:
@@ -449,7 +373,7 @@ def _section(annotation: Any, value: Any, key: str) -> Any:
             raise InputError(f"{key}: expected settings by name ({key}.NAME.OPTION=…), got {value!r}")
         return {str(name): _section(get_args(annotation)[1], each, f"{key}.{name}") for name, each in value.items()}
     classes = section_classes(annotation)
-    if not classes or (value is None and allows_none(annotation)):
+    if not classes or (value is None and type(None) in get_args(annotation)):
         return value
     if not isinstance(value, Mapping):
         raise InputError(f"{key}: is a section with options of its own ({key}.NAME=…), got {value!r}")
@@ -463,10 +387,7 @@ def _section(annotation: Any, value: Any, key: str) -> Any:
 
 
 def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
-    """Builds settings from plain dicts, lists and scalars; missing options have their defaults.
-
-    Numbers must be numbers, not text, and NaN is refused, with what the class says of its range.
-    """
+    """Builds settings from plain dicts, lists and scalars; missing options have their defaults."""
     import dacite
     from dacite.exceptions import DaciteFieldError
 
@@ -474,37 +395,20 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
     values: dict[str, Any] = {}
     for name, value in data.items():
         if name not in types:
-            options = [prefix + option for option in types]
-            raise InputError(f"{prefix}{name}: no such option{near(f'{prefix}{name}', options)}")
+            raise InputError(f"{prefix}{name}: no such option{near(prefix + name, [prefix + each for each in types])}")
         values[name] = _prepare(_section(types[name], value, prefix + name), types[name])
     hooks: dict[Any, Any] = {
-        int: _strict(int, (int,)),
-        float: _strict(float, (int, float)),
+        int: _number(int, (int,)),
+        float: _number(float, (int, float)),
         Path: lambda value: Path(value) if isinstance(value, str) and value else value,
     }
-    nan = next((name for name, value in values.items() if _has_nan(value)), "")
     try:
-        built = dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
+        return dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
     except DaciteFieldError as error:
         name = str(error.field_path).partition(".")[0]
         raise InputError(wrong_value(options_by_key(cls, prefix)[prefix + name], data.get(name))) from error
     except InputError as error:
-        unexplained = nan and str(error).startswith(f"{nan}:") and NOT_FINITE not in str(error)
-        raise InputError(_named(str(error), prefix, types) + (f"; {NOT_FINITE}" if unexplained else "")) from error
-    except (ValueError, OverflowError):
-        # A class that counts with a number before it looks at it.
-        if not nan:
-            raise
-    if nan:
-        raise InputError(f"{wrong_value(options_by_key(cls, prefix)[prefix + nan], data[nan])}; {NOT_FINITE}")
-    return built
-
-
-def _has_nan(value: Any) -> bool:
-    """Whether a value, or one of a list, is the number NaN."""
-    if isinstance(value, (list, tuple)):
-        return any(map(_has_nan, value))
-    return isinstance(value, float) and value != value
+        raise InputError(_named(str(error), prefix, types)) from error
 
 
 def _named(message: str, prefix: str, names: Iterable[str]) -> str:
@@ -519,7 +423,7 @@ def _named(message: str, prefix: str, names: Iterable[str]) -> str:
 def check_required(cls: type, config: object) -> None:
     """Raises an InputError about the first required option that is empty."""
     for each in options_of(cls):
-        if each.required and not each.member and value_at(config, each.key) in (None, "", ()):
+        if each.metadata.get("required") and not each.member and value_at(config, each.key) in (None, "", ()):
             name = f"{each.metavar or 'PATH'}" if each.key == "paths" else f"{each.key}="
             raise InputError(f"{name} is missing: {each.help}")
 

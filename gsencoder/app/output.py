@@ -2,10 +2,10 @@
 
 import ctypes
 import errno
-import math
 import os
 import platform
 import re
+import resource
 import secrets
 import shutil
 import sys
@@ -37,37 +37,25 @@ from gsencoder.core.files import (
 )
 from gsencoder.core.threads import available_cores
 
-LIBRARIES = {
-    **{name: name for name in ("numpy", "torch", "numba", "scipy", "open3d", "trimesh", "pycolmap", "onnxruntime")},
-    **{name: name for name in ("gsply", "safetensors", "transformers", "gsplat", "triton")},
-    "sklearn": "scikit-learn",
-}
-"""Module and distribution of the libraries whose versions are recorded, if the run imported them."""
+LIBRARIES = (
+    *("numpy", "torch", "numba", "scipy", "open3d", "trimesh", "pycolmap", "onnxruntime"),
+    *("gsply", "safetensors", "transformers", "gsplat", "triton", "sklearn"),
+)
+"""Libraries whose versions are recorded, if the run imported them."""
 
 
 def peak_memory_mb() -> float:
-    """Peak resident memory of this process, MiB; NaN where the system does not say it."""
+    """Peak resident memory of this process, MiB."""
     # On Linux ru_maxrss starts from the size of the parent at the fork; VmHWM is that of the process alone.
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024
-    try:
-        import resource
-    except ImportError:
-        return math.nan
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 2**20
 
 
 class Summary:
-    """Collects the settings of a run, the seconds of each step, warnings and results.
-
-    Attributes:
-        results: figures and file names; filled by the command.
-        warnings: one line each, in order; see `add_warning`.
-        timings: seconds by step, in order of first start.
-        began: when the run began, by `time.perf_counter`.
-    """
+    """Collects the settings of a run, the seconds of each step, warnings and results (figures and file names)."""
 
     def __init__(self, command: str, settings: Mapping[str, Any], began: float | None = None) -> None:
         self.command = command
@@ -104,6 +92,10 @@ class Summary:
         for name, seconds in steps.items():
             self.timings[name] = self.timings.get(name, 0.0) + seconds
 
+    def costs(self) -> dict[str, float]:
+        """What pages say of the run."""
+        return {"seconds": sum(self.timings.values()), "peak memory, MiB": peak_memory_mb()}
+
     def to_dict(self) -> dict[str, Any]:
         """The record as JSON values. `non_finite` lists the results that were not finite and are null."""
         lost: list[str] = []
@@ -131,13 +123,12 @@ def _versions() -> dict[str, str]:
     versions = {"python": platform.python_version()}
     for module in (name for name in LIBRARIES if name in sys.modules):
         with suppress(PackageNotFoundError):
-            versions[module] = version(LIBRARIES[module])
+            versions[module] = version("scikit-learn" if module == "sklearn" else module)
     return versions
 
 
 def check_output_files(paths: Iterable[Path], overwrite: bool) -> None:
-    """Checks files before the work whose results they will hold: none exists that may not be replaced, and all can be
-    written."""
+    """Checks, before the work, that files of results can be written and replace none that may not be replaced."""
     for path in paths:
         _refuse_existing(path, overwrite)
         check_writable(path)
@@ -152,11 +143,8 @@ def _refuse_existing(path: Path, overwrite: bool) -> None:
 
 @contextmanager
 def output_file(path: Path, *, overwrite: bool, summary: Summary) -> Iterator[None]:
-    """Lets one run at a time write a file, and writes the summary beside it, as FILE.summary.json with its checksum.
-
-    Two runs of one out= would otherwise leave the file of one beside the summary of the other. Runs that write into the
-    same folder wait for each other here, for as long as the writing takes.
-    """
+    """Lets one run at a time write a file, and writes the summary beside it, as FILE.summary.json with its checksum:
+    two runs of one out= would otherwise leave the file of one beside the summary of the other."""
     with ExitStack() as stack:
         # Where the folder is missing or refuses, whoever writes the file says so.
         with suppress(OSError):
@@ -182,10 +170,6 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
             old and new are exchanged in one step.
         summary: written into the folder at the end, as summary.json, with the checksums of files that have none.
-
-    Raises:
-        InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
-            or the disk is full.
     """
     # Of a symbolic link the target is replaced, not the link.
     target = Path(os.path.realpath(path))
@@ -281,7 +265,7 @@ def is_within(path: str | Path, folder: str | Path) -> bool:
 
 
 def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """Yields all strings in nested settings that could be paths, with their keys."""
+    """All strings in nested settings that could be paths, with their keys."""
     if isinstance(value, str) and 0 < len(value) < 4096 and "\0" not in value:
         yield key, value
     elif isinstance(value, Mapping):
@@ -377,14 +361,13 @@ def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) ->
     if isinstance(error, shutil.Error) and error.args and error.args[0] and not isinstance(error.args[0], str):
         source, copy, reason = map(str, error.args[0][0])
         names = [copy, source]
-        reason = reason.partition("] ")[2].partition(": ")[0] or reason
     for name in names:
         if name.startswith(str(partial)):
             return f"{name.replace(str(partial), str(path))}: cannot write: {reason or error}"
     if str(target) in names:
-        return f"{path}: cannot be replaced by the results: {error.strerror or error}"
+        return f"{path}: cannot be replaced by the results: {reason or error}"
     if str(target.parent) in names:
-        return f"{path}: the results are written; the system cannot sync {target.parent}: {error.strerror or error}"
+        return f"{path}: the results are written; the system cannot sync {target.parent}: {reason or error}"
     return None
 
 
@@ -418,9 +401,6 @@ class WorkFolder:
     Enter it before the output folder and `take` it inside: it is then locked until the results have been renamed into
     place, and removed after that. If the block ends early, the folder stays as it is, and a note of the error says so;
     one that holds no state yet is removed.
-
-    Attributes:
-        path: of the folder, with symbolic links resolved.
     """
 
     def __init__(self, path: Path) -> None:
@@ -429,11 +409,7 @@ class WorkFolder:
         self._taken = False
 
     def take(self, *, resume: bool) -> None:
-        """Creates and locks the folder, or that of an interrupted run, whose state is removed without `resume`.
-
-        Raises:
-            InputError: it holds something else, another run uses it, or it cannot be created or emptied.
-        """
+        """Creates and locks the folder, or that of an interrupted run, whose state is removed without `resume`."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             names = [entry.name for entry in self.path.iterdir()]

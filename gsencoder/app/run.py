@@ -2,8 +2,10 @@
 queue of several scenes."""
 
 import json
+import math
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -25,10 +27,13 @@ from gsencoder.app.output import (
     refuse_to_replace_inputs,
     sibling_folder,
 )
-from gsencoder.core.errors import BusyError, InputError, listed, one_line, printable
+from gsencoder.core.budget import Budget
+from gsencoder.core.errors import BusyError, InputError, SceneWarning, listed, one_line, printable
 from gsencoder.core.files import SUMMARY_NAME, plain, read_foreign_text
 from gsencoder.core.process import Device, ProcessRank, refuse_several
+from gsencoder.core.settings import describe_values, shown_value
 from gsencoder.data.scenes import check_names, scene_name
+from gsencoder.data.up import Up
 
 T = TypeVar("T")
 
@@ -48,22 +53,11 @@ def console(quiet: bool = False) -> Console:
 
 
 class Progress:
-    """Shows the progress of loops: a transient bar on a terminal, else a line every few seconds.
-
-    Example:
-        track = Progress(quiet=config.quiet)
-        for view in track(views, "lifting views"):
-            ...
-    """
+    """Shows the progress of loops, `for view in track(views, "lifting views")`: a transient bar on a terminal, else a
+    line every few seconds."""
 
     def __init__(self, *, quiet: bool = False, stream: Any = None, every: float = 10.0) -> None:
-        """Args:
-        stream: the text stream to write to; None = standard error.
-        every: seconds between lines if the stream is not a terminal; shorter loops print nothing.
-        """
-        self._stream = sys.stderr if stream is None else stream
-        self._quiet = quiet
-        self._every = every
+        self._stream, self._quiet, self._every = sys.stderr if stream is None else stream, quiet, every
         self._bars: Bars | None = None
         self._depth = 0
 
@@ -111,13 +105,7 @@ class Progress:
 
 
 class Run(Summary):
-    """A run of a command: its settings and its record, what it prints, and where it writes.
-
-    Attributes:
-        config: the settings.
-        screen: for results and tables.
-        track: shows the progress of loops.
-    """
+    """A run of a command: its settings and its record, what it prints, and where it writes."""
 
     def __init__(self, command: str, config: CommonConfig, began: float | None = None) -> None:
         super().__init__(command, settings(config), began)
@@ -131,6 +119,46 @@ class Run(Summary):
     def out(self, *default: str) -> Path:
         """Where the results go: out=, or outputs/DEFAULT."""
         return self.config.out or Path("outputs", *default)
+
+    def report_up(self, scene: str, up: Up | None) -> None:
+        """Records which way is up in a scene; an estimate is printed."""
+        self.results["up"] = None if up is None else up.to_dict()
+        if up is not None and up.source != "files":
+            self.print(f"up of {scene}: {up.describe()} (data.up= states it)")
+
+    def report_choice(
+        self,
+        scene: str,
+        chosen: Mapping[str, Any],
+        *,
+        predicted: Mapping[str, float],
+        notes: Sequence[str],
+        **more: Any,
+    ) -> None:
+        """Prints the setting that a budget chose, warns of the limits that it is expected to break, and records both
+        with what is predicted by limit and with `more`."""
+        known = {name: value for name, value in predicted.items() if math.isfinite(value)}
+        self.results["budget"] = {"chosen": dict(chosen), "predicted": known, "notes": list(notes), **more}
+        self.print(f"{scene}: budget: {describe_values(chosen)}")
+        for note in notes:
+            warnings.warn(note, SceneWarning, stacklevel=3)
+
+    def report_budget(self, budget: Budget, measured: Mapping[str, float]) -> list[str]:
+        """A line for each limit that is kept; warns of those that are broken, and records both numbers, after
+        `report_choice`. A limit that is not in `measured` was not measured."""
+        limits = {name: budget.limit(name) for name in budget.limits}
+        measured = {name: measured[name] for name in limits if name in measured}
+        self.results["budget"].update(limits=limits, measured=measured)
+        lines = []
+        for name, limit in limits.items():
+            if name not in measured:
+                lines.append(f"budget.{name}: limit {shown_value(limit)}, not measured (budget.check=false)")
+            elif measured[name] <= limit:
+                lines.append(f"budget.{name}: limit {shown_value(limit)}, measured {measured[name]:.4g}")
+            else:
+                text = f"budget.{name}: the limit is {shown_value(limit)}, and it became {measured[name]:.4g}"
+                warnings.warn(text, SceneWarning, stacklevel=3)
+        return lines
 
     @contextmanager
     def folder(self, out: Path) -> Iterator[Path]:
@@ -172,15 +200,7 @@ class Run(Summary):
 
         Of several scenes those are skipped whose folder holds the results of the same settings, and those that another
         process is writing now: processes with other numbers `worker` share the scenes, and each begins at another one.
-        An error in one does not stop the others.
-
-        Args:
-            paths: the scenes.
-            part: what the results are called.
-            one: does one scene: its path, the folder for its results, and its run.
-
-        Raises:
-            InputError: two scenes have one name, the error of the only scene, or some of several scenes failed.
+        An error in one does not stop the others. `one` does one scene: its path, the folder for its results, its run.
         """
         check_names(paths)
         if len(paths) == 1:
@@ -218,13 +238,12 @@ class Run(Summary):
             )
 
     @contextmanager
-    def processes(self, device: Device, out: Path, *, state: str = "") -> Iterator["Group"]:
-        """Joins the processes that a launcher started; with `state`, OUT.state is for unfinished work of the group."""
-        from gsencoder.train.distributed import join_processes  # with torch
-
+    def processes(self, join: Callable[..., Any], device: Device, out: Path, *, state: str = "") -> Iterator["Group"]:
+        """Joins the processes that a launcher started by `gsencoder.train.distributed.join_processes`; with `state`,
+        OUT.state is for unfinished work of the group."""
         with (
             WorkFolder(sibling_folder(out, state)) as work,
-            join_processes(device, settings=self.settings) as (process, used),
+            join(device, settings=self.settings) as (process, used),
             ExitStack() as results,
         ):
             if not process.is_first:
@@ -234,13 +253,8 @@ class Run(Summary):
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A run that processes of one launcher share; the first of them writes and prints.
-
-    Attributes:
-        work: for unfinished work.
-        process: the rank of this process.
-        device: that this process computes on.
-    """
+    """A run that processes of one launcher share; the first of them writes and prints. `work` is for unfinished work,
+    `device` the one that this process computes on."""
 
     run: Run
     out: Path

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import find_file
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import MEMORY_FILE, WORDS_FILE, load_features, load_memories, table_path, teachers_in
 from gsencoder.infer.localize import select_features
 from gsencoder.infer.views.photographs import with_photographs
@@ -81,15 +79,6 @@ def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
     return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
 
 
-def with_reported_up(scene: Scene, run: Run) -> Scene:
-    """The scene with `up`, which the summary records; an estimate is printed."""
-    scene, up = with_up(scene)
-    run.results["up"] = None if up is None else up.to_dict()
-    if up is not None and up.source != "files":
-        run.print(f"up of {scene.name}: {up.describe()} (data.up= states it)")
-    return scene
-
-
 def memory_of(folder: Path, scene: Scene) -> QueryMemory | None:
     """The memory that the one feature set of a scene was decoded from; None where features are stored themselves."""
     if not (folder / MEMORY_FILE).is_file() and not teachers_in(folder, MEMORY_FILE):
@@ -99,13 +88,8 @@ def memory_of(folder: Path, scene: Scene) -> QueryMemory | None:
 
 
 def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextConfig = TableTextConfig()) -> Words:
-    """The text table that was given, or the one in the folder of the features, with the tower that made it.
-
-    Args:
-        space: of the features that are asked; folders with several may hold words for each.
-        words_file: a file of words; empty = the one in the folder.
-        text: a tower that is given; otherwise it is searched for when a phrase needs it.
-    """
+    """The text table that was given, or the one in the folder of the features, with the tower that made it; a tower
+    that is not given is searched for when a phrase needs it."""
     if words_file:
         words = words_of_table(load_text_table(find_file(words_file, "words")), text)
         return with_training_names(words, _table_beside(folder, space))

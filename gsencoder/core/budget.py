@@ -3,7 +3,7 @@
 A stage lists its settings, cheapest first and the exact one last, and measures one of them on a sample of its input:
 some parts of a scene, some views, some steps. `choose` takes the cheapest setting that keeps a limit of error, or the
 most exact one that keeps seconds and megabytes. The stage then runs and measures what became of each limit
-(`gsencoder.app.summary` reports both numbers).
+(`gsencoder.app.run` reports both numbers).
 """
 
 from collections.abc import Callable, Iterable, Sequence

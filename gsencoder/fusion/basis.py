@@ -4,6 +4,9 @@ Lifting and rendering are linear, so features may be fused, stored and rendered 
 channels. Because rows of B sum to alpha and not to 1, a rendered map decodes as `(B @ z) @ components + alpha·mean`.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
@@ -139,3 +142,20 @@ def table_basis(
 def to_coordinates(basis: FeatureBasis, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:
     """Coordinates of vectors: (x − mean) @ componentsᵀ."""
     return ((vectors - basis.mean) @ basis.components.T).astype(np.float32)
+
+
+def basis_figures(basis: FeatureBasis | None, rank: int) -> dict[str, int | float]:
+    """The rank of a basis, and the share of the energy that it keeps of the vectors that it was fitted to; `rank` is
+    the number of columns of the features, which without a basis are all channels."""
+    return {"rank": rank, "energy_kept": basis.energy_kept if basis is not None else 1.0}
+
+
+def describe_basis(figures: Mapping[str, Any], scenes: str) -> str:
+    """The figures of `basis_figures` in a phrase, and those of `BasisFit.figures` where they are known, of `scenes`."""
+    phrase = f"rank {figures['rank']}, keeps {figures['energy_kept']:.4f} of the energy"
+    if "other_energy" not in figures:
+        return phrase
+    return (
+        f"{phrase}, and {figures['other_energy']:.4f} in {scenes} (cosine {figures['other_cosine']:.3f}, worst 5 % "
+        f"below {figures['other_worst']:.3f})"
+    )

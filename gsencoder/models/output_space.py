@@ -168,7 +168,7 @@ def teacher_of_space(spaces: Mapping[str, FeatureSpace], name: str | None = None
         return next(iter(spaces))
     if name not in teachers:
         hint = "name one of them" if name is None else f"got {name!r}"
-        raise InputError(f"{option}: the encoder gives features of {', '.join(spaces)}; {hint}")
+        raise InputError(f"{option}: there are features of {', '.join(spaces)}; {hint}")
     return teachers[name]
 
 

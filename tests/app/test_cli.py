@@ -13,13 +13,12 @@ from toy_commands import splat, write_toy
 from gsencoder import __version__
 from gsencoder.app import main as cli
 from gsencoder.app.commands.inspect import report_table
-from gsencoder.app.commands.repair import Fix
 from gsencoder.app.main import COMMANDS
 from gsencoder.app.output import output_folder
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Stopped
 from gsencoder.data.splats.files import load_splat, read_raw, save_splat
-from gsencoder.data.splats.repair import FIXES, inspect_splat
+from gsencoder.data.splats.repair import inspect_splat
 
 
 def broken_splat(path: Path) -> Path:
@@ -86,18 +85,12 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
     ("words", "problem"),
     [
         (["inspct"], "inspct: no such command; did you mean inspect?"),
-        (["zzz"], "zzz: no such command (gsencoder --help lists them)"),
-        (["inspect", "--overwrit"], "--overwrit: no such flag"),
         (["inspect", "--hepl"], "--hepl: no such flag; did you mean --help?"),
         (["inspect", "--out=x"], "--out=…: no such flag; settings are written out=…"),
         (["inspect", "a.ply", "overwrit=true"], "did you mean overwrite?"),
         (["inspect"], "PATH is missing: scenes with posed views, or splats"),
-        (["inspect", ""], "a path is empty"),
-        (["inspect", "no/such.ply"], "no/such.ply: no such file"),
-        (["repair", "a.ply"], "out= is missing"),
         (["repair", "a.ply", "b.ply", "out=x.ply"], "paths: expected one splat file or scene, got 2"),
         (["repair", "a.ply", "fix=quat", "out=x.ply"], "got 'quat'; did you mean quats?"),
-        (["repair", "a.ply", "fix=", "out=x.ply"], "fix: expected the name of a defect, got none"),
         (["inspect", "a.ply", "quiet=x\ny"], "quiet: expected true or false"),
     ],
 )
@@ -167,12 +160,6 @@ def test_repair_keeps_positions_that_float32_cannot_hold(tmp_path: Path) -> None
     save_splat(path, gaussians, origin=far)
     assert cli.main(["repair", str(path), f"out={tmp_path / 'new.ply'}", "quiet=true"]) == 0
     np.testing.assert_allclose(load_splat(tmp_path / "new.ply", origin=far).means, gaussians.means, atol=1e-6)
-
-
-def test_repair_offers_every_fix_there_is() -> None:
-    from typing import get_args
-
-    assert get_args(Fix) == (*FIXES, "all")
 
 
 def test_warnings_are_lines_on_stderr_and_entries_of_the_summary(

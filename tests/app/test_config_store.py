@@ -48,12 +48,6 @@ def union_members(cls: type, prefix: str = "") -> Iterator[tuple[str, type]]:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_composed_defaults_are_those_of_the_dataclass(command: str) -> None:
-    cls = config_of(command)
-    assert compose(command, cls, []) == cls()
-
-
-@pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.slow
 def test_every_member_of_every_choice_has_the_defaults_of_its_dataclass_and_the_default_one_changes_nothing(
     command: str,
@@ -84,14 +78,6 @@ def test_every_setting_is_documented_and_known_to_hydra(command: str) -> None:
         assert option.help, f"{command}: {option.key} has no metadata help"
         assert not option.help.endswith("."), f"{command}: {option.key}: help is a phrase, without a full stop"
         assert option.member or value_at(composed, option.key) is not MISSING, f"Hydra does not know {option.key}"
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_no_option_has_the_name_of_a_group(command: str) -> None:
-    # Hydra would take its value for the name of a member.
-    groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
-    groups |= {group for name in COMMANDS for group in choices_of(config_of(name)).groups}
-    assert not groups & {option.hydra_key for option in options_of(config_of(command))}
 
 
 def leaves(data: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
@@ -230,12 +216,6 @@ def test_choices_come_from_unions_presets_and_experiments_wherever_their_section
         student=StudentConfig(network=NetworkConfig(width=64), damage=BlurConfig(radius=3)),
         teacher=BlurConfig(radius=9),
     )
-
-
-def test_a_member_has_the_values_that_the_field_gives_it(conf: Path) -> None:
-    config = toy(conf, "student/damage=noise", "teacher=noise")
-    assert config.student.damage == NoiseConfig(sigma=0.3)
-    assert config.teacher == NoiseConfig()
 
 
 def test_an_experiment_goes_over_the_defaults_and_the_command_line_over_the_experiment(conf: Path) -> None:

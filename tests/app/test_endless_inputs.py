@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,27 +20,18 @@ KINDS = ("pipe", "device", "folder", "dangling")
 OPTIONS = [
     "fuse ROOM splat=BAD.ply teacher=palette",
     "fuse ROOM teacher=labels teacher.words=BAD.npz",
-    "fuse ROOM basis=BAD.safetensors",
-    "encode BAD.ply",
     "encode ROOM weights=BAD.safetensors",
     "pack FEATURES/BAD.safetensors",
     "localize FEATURES query=mug words=BAD.npz",
     "localize FEATURES query=mug pose=BAD.json",
     "localize FEATURES queries=BAD.txt",
-    "select FEATURES queries=BAD.txt",
-    "views FEATURES queries=BAD.txt",
-    "view FEATURES words=BAD.npz",
-    "ask FEATURES dry_run=true questions=BAD.json",
     "ask FEATURES dry_run=true questions=BAD.jsonl",
     "export weights=BAD.safetensors",
     "evaluate ROOM protocol=instances classes=BAD.csv",
     "train ROOM split=BAD.txt",
-    "memory ROOM splat=BAD.ply",
     "repair BAD.ply",
-    "inspect BAD.ply",
     "inspect BAD.sog",
     "reconstruct BAD.mp4",
-    "score instances predictions=TABLES truth=TABLES classes=BAD.csv",
     "score instances predictions=TABLES truth=TABLES classes=scannet20 label_map=BAD.tsv",
     "score answers predictions=BAD.json truth=TRUTH/answers.json",
     "score answers predictions=TABLES/a.txt truth=BAD.json",
@@ -53,12 +45,10 @@ OPTIONS = [
 CONTENTS = [
     ("fuse ROOM teacher=palette", "room/transforms.json"),
     ("fuse ROOM", "room/objects.json"),
-    ("questions ROOM", "room/objects.json"),
     ("inspect ROOM", "room/transforms.json"),
     ("localize FEATURES query=mug", "features/features.safetensors"),
     ("pack FEATURES", "features/scene.safetensors"),
     ("score instances predictions=TABLES truth=TRUTH classes=scannet20", "truth/a.txt"),
-    ("score semantics predictions=TABLES truth=TRUTH classes=scannet20", "truth/a.txt"),
     ("score instances predictions=TABLES truth=TRUTH classes=scannet20", "tables/a.txt"),
 ]
 """Commands, and the file of their inputs that is no file."""
@@ -104,11 +94,8 @@ def test_an_option_that_names_no_file_is_refused(
     for part in ("room", "features", "tables", "truth"):
         (tmp_path / part).symlink_to(made / part)
     path = tmp_path / name.replace("BAD", "bad")
-    # A pipe, which blocks whoever opens it, and one of the others.
-    for kind in ("pipe", KINDS[1 + OPTIONS.index(words) % 3]):
-        make_no_file(path, kind)
-        assert path.name in refusal(words, tmp_path, capsys), kind
-        path.rmdir() if kind == "folder" else path.unlink()
+    make_no_file(path, KINDS[OPTIONS.index(words) % 4])
+    assert path.name in refusal(words, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(("words", "name"), CONTENTS)
@@ -118,40 +105,21 @@ def test_a_file_of_a_scene_that_is_none_is_refused(
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     path = tmp_path / name
     path.unlink()
-    for kind in ("pipe", "folder"):
-        make_no_file(path, kind)
-        assert path.name in refusal(words, tmp_path, capsys), kind
-        path.rmdir() if kind == "folder" else path.unlink()
-
-
-SETTINGS = {"seed": 0, "model": {"projector": 10**15}, "sizes": [2, 10**11]}
+    make_no_file(path, "pipe")
+    assert path.name in refusal(words, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(
-    "make",
-    [
-        lambda: np.zeros(10**14),
-        lambda: np.zeros((10**12, 10**12)),
-        lambda: torch.zeros(10**14),
-        lambda: torch.zeros(10**12, 10**12),
-        lambda: np.zeros(10**20),
-        lambda: bytearray(10**20),
-        lambda: [0] * 10**18,
-    ],
+    "make", [lambda: np.zeros(10**14), lambda: torch.zeros(10**14), lambda: np.zeros(10**20), lambda: [0] * 10**18]
 )
-def test_sizes_that_cannot_be_allocated_name_the_large_settings(make: object) -> None:
-    with (
-        pytest.raises(
-            InputError, match=r"^model.projector=1000000000000000, sizes=\[2, 100000000000\]: the machine has"
-        ),
-        _impossible_sizes(SETTINGS),
-    ):
-        make()  # type: ignore[operator]
+def test_sizes_that_cannot_be_allocated_are_one_line(make: Callable[[], object]) -> None:
+    with pytest.raises(InputError, match="^the machine has not enough memory for a size"), _impossible_sizes():
+        make()
 
 
 def test_other_errors_stay_as_they_are() -> None:
-    for error in (RuntimeError("shape"), ValueError("shape"), OverflowError("math range error"), InputError("its own")):
-        with pytest.raises(type(error), match=str(error)), _impossible_sizes(SETTINGS):
+    for error in (RuntimeError("shape"), OverflowError("math range error"), InputError("its own")):
+        with pytest.raises(type(error), match=str(error)), _impossible_sizes():
             raise error
 
 

@@ -72,7 +72,6 @@ def test_many_runs_complain_like_one(
     ("words", "problem"),
     [
         (["hydra/launcher=nowhere"], "no such launcher is installed; .*pip install 'gsencoder\\[slurm\\]'"),
-        (["hydra/launcher=submitit_local", "hydra.launcher.timeout_mim=1"], "timeout_mim: Hydra has no such setting"),
         (
             ["hydra/launcher=submitit_slurm", "+hydra.launcher.additional_parameters.account=mine"],
             "submitit_slurm: .*srun.*the logs of the jobs are in .*submitit",

@@ -27,10 +27,9 @@ def test_a_folder_appears_whole_when_the_block_ends(tmp_path: Path) -> None:
     assert names(path.parent) == ["out"]
 
 
-@pytest.mark.parametrize("error", [ValueError("bad"), KeyboardInterrupt(), SystemExit(3), MemoryError()])
-def test_whatever_ends_the_block_early_leaves_nothing(tmp_path: Path, error: BaseException) -> None:
-    with pytest.raises(type(error)):
-        write_and_raise(tmp_path / "out", error)
+def test_whatever_ends_the_block_early_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        write_and_raise(tmp_path / "out", KeyboardInterrupt())
     assert names(tmp_path) == []
 
 
@@ -46,16 +45,6 @@ def test_an_existing_folder_is_refused_unless_overwrite(tmp_path: Path) -> None:
     fill(tmp_path / "out", "old")
     with pytest.raises(InputError, match="holds the results of an earlier run; give another out= or overwrite=true"):
         fill(tmp_path / "out", "new")
-    fill(tmp_path / "out", "new", overwrite=True)
-    assert (tmp_path / "out" / "deep" / "data.txt").read_text() == "new"
-    assert names(tmp_path) == ["out"]
-
-
-def test_replacing_works_where_the_system_cannot_exchange_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(outputs, "_exchange", lambda *_: False)
-    fill(tmp_path / "out", "old")
     fill(tmp_path / "out", "new", overwrite=True)
     assert (tmp_path / "out" / "deep" / "data.txt").read_text() == "new"
     assert names(tmp_path) == ["out"]
@@ -148,16 +137,6 @@ def test_a_second_run_into_the_same_folder_is_told_of_the_first(tmp_path: Path) 
     assert names(tmp_path) == ["out", "out2"]
 
 
-def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
-    (tmp_path / ".out.partial-0123abcd").mkdir()
-    (tmp_path / ".out.partial-0123abcd" / "big").write_text("x")
-    others = [".out.partial-mine", ".out2.partial-0123abcd", "out.partial-0123abcd"]
-    for name in others:
-        (tmp_path / name).mkdir()
-    fill(tmp_path / "out", "new")
-    assert names(tmp_path) == sorted([*others, "out"])
-
-
 KILLED = """
 import os, sys, time
 from gsencoder.app.output import output_folder
@@ -177,13 +156,16 @@ def test_a_kill_leaves_no_output_folder_and_the_next_run_cleans_up(tmp_path: Pat
         process.wait()
     (left,) = names(tmp_path)
     assert left.startswith(".out.partial-")
+    others = [".out.partial-mine", ".out2.partial-0123abcd", "out.partial-0123abcd"]
+    for name in others:
+        (tmp_path / name).mkdir()
     fill(tmp_path / "out", "new")
-    assert names(tmp_path) == ["out"]
+    assert names(tmp_path) == sorted([*others, "out"])
 
 
 def test_of_runs_that_begin_in_one_moment_one_gets_the_folder(tmp_path: Path) -> None:
     """The outcome of each is its own, or that another is writing; none removes what another has just made."""
-    for turn in range(20):
+    for turn in range(8):
         begun, outcomes = threading.Barrier(4), []
 
         def run(out: Path = tmp_path / str(turn), begun: threading.Barrier = begun, told: list[str] = outcomes) -> None:

@@ -11,26 +11,21 @@ from output_folders import fill, names, write_and_raise
 from gsencoder.app.output import output_folder, refuse_to_replace_inputs
 from gsencoder.core.errors import InputError
 
+FULL, LARGE = "no space left on the device", r"a file would grow larger than .* \(ulimit -f\)"
+
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "problem"),
     [
-        OSError(errno.ENOSPC, "No space left on device", "x"),
-        OSError(errno.EDQUOT, "Disk quota exceeded"),
-        OSError("4096 requested and 100 written"),
-        RuntimeError("I/O error: No space left on device (os error 28)"),
+        (OSError(errno.ENOSPC, "No space left on device", "x"), FULL),
+        (OSError("4096 requested and 100 written"), FULL),
+        (RuntimeError("I/O error: No space left on device (os error 28)"), FULL),
+        (OSError(errno.EFBIG, "File too large"), LARGE),
     ],
 )
-def test_a_full_disk_is_one_line_that_names_the_folder(tmp_path: Path, error: Exception) -> None:
-    with pytest.raises(InputError, match=r"out: no space left on the device: no result was written$") as caught:
+def test_a_full_disk_is_one_line_that_names_the_folder(tmp_path: Path, error: Exception, problem: str) -> None:
+    with pytest.raises(InputError, match=rf"out: {problem}: no result was written$"):
         write_and_raise(tmp_path / "out", error)
-    assert ".partial" not in str(caught.value)
-    assert names(tmp_path) == []
-
-
-def test_a_file_beyond_the_shells_limit_is_one_line_that_names_the_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"out: a file would grow larger than .* \(ulimit -f\): no result was written"):
-        write_and_raise(tmp_path / "out", OSError(errno.EFBIG, "File too large"))
     assert names(tmp_path) == []
 
 
@@ -61,20 +56,14 @@ def test_a_place_that_cannot_be_written_is_a_named_error(tmp_path: Path) -> None
         fill(tmp_path / "file" / "out", "x")
     with pytest.raises(InputError, match="cannot write here: Not a directory"):
         fill(tmp_path / "file" / "deep" / "out", "x")
-    with pytest.raises(InputError, match="cannot write here: File name too long"):
-        fill(tmp_path / ("a" * 300) / "out", "x")
 
 
 def test_a_name_longer_than_the_system_allows_is_refused_before_the_work(tmp_path: Path) -> None:
-    refuse_to_replace_inputs(tmp_path / ("x" * 300), {"paths": ["scene"]})
     with (
         pytest.raises(InputError, match="cannot write here: File name too long"),
         output_folder(tmp_path / ("x" * 300)),
     ):
         raise AssertionError("the block must not begin")
-
-
-def test_names_as_long_as_the_system_allows_work(tmp_path: Path) -> None:
     fill(tmp_path / ("ü" * 127), "x")
     assert names(tmp_path) == ["ü" * 127]
 
@@ -89,19 +78,14 @@ def test_inputs_inside_the_folder_to_replace_are_protected(tmp_path: Path) -> No
     (tmp_path / "link.ply").symlink_to("splat.ply")
     with pytest.raises(InputError, match=r"splat.ply: is the input paths=.*link.ply, so it cannot be replaced"):
         refuse_to_replace_inputs(tmp_path / "splat.ply", {"paths": [str(tmp_path / "link.ply")]})
-    refuse_to_replace_inputs(tmp_path / "splat.ply", {"paths": [str(tmp_path)]})
     refuse_to_replace_inputs(tmp_path / "out", {"out": out, "paths": [str(tmp_path)], "splat": str(tmp_path / "out2")})
     refuse_to_replace_inputs(tmp_path / "out", {"weights": str(tmp_path / "out" / "nothing"), "query": "a\0b"})
-    refuse_to_replace_inputs(tmp_path / "new", {"paths": [str(tmp_path / "new")]})
-    refuse_to_replace_inputs(None, {"paths": [inside]})
 
 
-@pytest.mark.parametrize(
-    ("words", "problem"), [("No space left on device", "no space left"), ("File too large (os error 27)", "ulimit -f")]
-)
-def test_a_disk_that_is_full_elsewhere_is_not_said_to_be_full_here(tmp_path: Path, words: str, problem: str) -> None:
+def test_a_disk_that_is_full_elsewhere_is_not_said_to_be_full_here(tmp_path: Path) -> None:
+    words = "No space left on device"
     with (
-        pytest.raises(InputError, match=rf"out: .*{problem}.*: no result was written$"),
+        pytest.raises(InputError, match=r"out: no space left.*: no result was written$"),
         output_folder(tmp_path / "out") as own,
     ):
         raise InputError(f"{own}/a.ply: cannot be written: {words}")

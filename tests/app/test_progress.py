@@ -5,7 +5,6 @@ import io
 import pytest
 from rich.table import Table
 
-from gsencoder.app import run as progress
 from gsencoder.app.run import Progress, console
 
 
@@ -27,13 +26,6 @@ def test_progress_passes_every_item_on(terminal: bool, quiet: bool) -> None:
     assert pairs == [(a, b) for a in range(3) for b in "xy"]
     assert bool(stream.getvalue()) != quiet
     assert not terminal or quiet or "\x1b" in stream.getvalue()
-
-
-def test_labels_are_shown_as_they_are() -> None:
-    for terminal in (False, True):
-        stream = Stream(terminal)
-        assert list(Progress(stream=stream, every=0.0)(range(1), "view [red]")) == [0]
-        assert "view [red]" in stream.getvalue()
 
 
 def test_progress_off_a_terminal_is_a_line_now_and_then() -> None:
@@ -72,23 +64,3 @@ def test_control_characters_of_names_are_not_printed(capsys: pytest.CaptureFixtu
     assert printed.count("a\N{REPLACEMENT CHARACTER}[2J") == 3
     console().print("Grün [red] 中\n\tb")
     assert "Grün [red] 中\n" in capsys.readouterr().out
-
-
-def test_lines_come_from_the_stated_seconds_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "after" in "".join(_lines(monkeypatch, 10.0))
-    assert _lines(monkeypatch, 9.9) == []
-
-
-def _lines(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[str]:
-    times = iter([0.0, seconds, seconds, seconds])
-    monkeypatch.setattr(progress.time, "monotonic", lambda: next(times))
-    stream = Stream(terminal=False)
-    list(Progress(stream=stream)(range(1), "views"))
-    return stream.getvalue().splitlines()
-
-
-def test_results_that_go_to_no_terminal_have_two_hundred_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert console().width == 200
-    monkeypatch.setattr(progress.sys, "stdout", Stream(terminal=True))
-    monkeypatch.setenv("COLUMNS", "90")
-    assert console().width == 90

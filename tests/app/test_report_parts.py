@@ -1,24 +1,25 @@
 """The figures of pages of results are those of the results."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from selected_rooms import SPACE, selected_room, with_more, words
+from selected_rooms import SPACE, selected_room, words
 
 from gsencoder.app import main as cli
-from gsencoder.app import reports as demo
 from gsencoder.app import reports as parts
-from gsencoder.app import reports as results
-from gsencoder.app.output import Summary
-from gsencoder.app.reports import TeacherResult
+from gsencoder.app.commands import demo
+from gsencoder.app.commands.localize import add_words
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.run import Run
+from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.fuse import FuseConfig, Fusion
 from gsencoder.infer.localize import localize
+from gsencoder.infer.page.page import Bundle
 from gsencoder.infer.page.report import HtmlReport
 from gsencoder.teachers.labels import PaletteTeacher
 from gsencoder.text.table import make_text_table, save_text_table
@@ -62,7 +63,7 @@ class Page(HtmlReport):
 
 @pytest.fixture
 def page(monkeypatch: pytest.MonkeyPatch) -> Page:
-    monkeypatch.setattr(results, "HtmlReport", Page)
+    monkeypatch.setattr(parts, "HtmlReport", Page)
     return Page()
 
 
@@ -70,8 +71,8 @@ def last() -> Page:
     return Page.made[-1]
 
 
-def summary_of(**arguments: Any) -> Summary:
-    summary = Summary("test", {})
+def summary_of(**arguments: Any) -> Run:
+    summary = Run("test", CommonConfig())
     summary.results.update(arguments)
     summary.add_seconds({"load": 1.5, "work": 2.0})
     return summary
@@ -92,7 +93,7 @@ def found() -> Localization:
 @pytest.mark.filterwarnings("ignore:.*words have no box")
 def test_words_have_a_row_each_of_their_best_box(page: Page) -> None:
     made = found()
-    parts.add_words(page, SCENE, made)
+    add_words(page, SCENE, made)
     (rows,) = page.tables
     assert [row["word"] for row in rows] == ["mug", "table", "lamp"]
     assert [row["boxes"] for row in rows] == [2, 1, 0]
@@ -103,38 +104,9 @@ def test_words_have_a_row_each_of_their_best_box(page: Page) -> None:
     assert (rows[2]["score"], rows[2]["center of the first"]) == (0.0, "–")
     assert page.shown[0][1] == ["mug: 2 boxes", "table: 1 box", "lamp: no box"]
     ious = {"mug": 0.9, "table": 0.25, "lamp": 0.0}
-    parts.add_words(page, SCENE, made, ious)
+    add_words(page, SCENE, made, ious)
     assert [row["IoU with the truth"] for row in page.tables[1]] == [0.9, 0.25, 0.0]
     assert page.shown[2][1] == ["mug: IoU 0.90 with the true box", "table: IoU 0.25 with the true box", "lamp: no box"]
-
-
-@pytest.mark.filterwarnings("ignore:.*words have no box")
-def test_a_mark_on_the_scale_is_the_threshold_that_all_words_have(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    marks: list[float | None] = []
-
-    def scale(width: int, low: float, high: float, *, mark: float | None) -> np.ndarray:
-        marks.append(mark)
-        return np.zeros((2, width, 3), np.uint8)
-
-    monkeypatch.setattr(parts, "color_bar", scale)
-    for thresholds in ([0.5, 0.5, 0.5], [0.5, 0.25, 0.5]):
-        made = replace(found(), thresholds=np.array(thresholds, np.float32))
-        parts.add_words(page, SCENE, made)
-    assert marks == [0.5, None]
-
-
-@pytest.mark.filterwarnings("ignore:.*words have no box")
-def test_pictures_of_words_are_in_the_order_of_the_words(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    def drawn(*_: Any, per_word: int) -> Iterator[tuple[str, np.ndarray]]:
-        assert per_word == 1
-        for number, word in ((1, "table"), (2, "lamp"), (0, "mug")):
-            yield f"{number:02d}_{word}_view", np.full((2, 2, 3), number, np.uint8)
-
-    monkeypatch.setattr(parts, "relevancy_pictures", drawn)
-    parts.add_words(page, SCENE, found())
-    pictures, captions = page.shown[0]
-    assert [int(picture[0, 0, 0]) for picture in pictures] == [0, 1, 2]
-    assert [caption.partition(":")[0] for caption in captions] == ["mug", "table", "lamp"]
 
 
 def pictured() -> Scene:
@@ -146,9 +118,8 @@ def pictured() -> Scene:
 
 
 def test_four_views_from_first_to_last_are_shown_with_their_numbers(page: Page) -> None:
-    scene = with_more(pictured(), np.array([[0.0, 0.0, 0.3]]), opacity=0.5)
-    features = scene.features["names"]
-    parts.add_views(page, scene, {"names": features})
+    scene = pictured()
+    parts.add_views(page, scene, {"names": scene.features["names"]})
     photographs, rendered, depths, fields = page.shown
     views = [0, 2, 5, 7]
     assert photographs[1] == [f"view {view}" for view in views]
@@ -156,15 +127,6 @@ def test_four_views_from_first_to_last_are_shown_with_their_numbers(page: Page) 
     assert rendered[1][1] == "view 2, rendered"
     assert depths[1][2] == "view 5, depth, bright is near"
     assert fields[1][3] == "view 7, names"
-    # What was never seen has no part in the colors.
-    blind = replace(features, features=features.features.copy())
-    blind.features[-1] = 100
-    other = Page()
-    parts.add_views(other, pictured(), {"names": SCENE.features["names"]})
-    again = Page()
-    parts.add_views(again, replace(scene, features={"names": blind}), {"names": blind})
-    difference = np.abs(again.shown[3][0][0].astype(int) - other.shown[3][0][0].astype(int))
-    assert np.median(difference) == 0
 
 
 def test_features_have_the_figures_of_their_basis_or_none(page: Page) -> None:
@@ -186,34 +148,16 @@ def test_features_have_the_figures_of_their_basis_or_none(page: Page) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*words have no box")
-def test_pages_begin_with_counts_and_end_with_seconds(page: Page, tmp_path: Path) -> None:
-    features = SCENE.features["names"]
-    weights = features.weights.copy()
-    weights[:7] = 0
-    results.report_fusion(tmp_path, SCENE, replace(features, weights=weights), 0.125, "names", summary_of())
-    facts = last().told
-    assert (facts["Gaussians"], facts["with features"], facts["views"]) == (len(KINDS), len(KINDS) - 7, 8)
-    assert facts["seconds"] == 3.5
-    assert facts["steps"] == {"load": 1.5, "work": 2.0}
-    assert last().tables[0][0]["centered cosine error"] == 0.125
-    results.report_words(tmp_path, SCENE, found(), summary_of())
-    assert {name: last().told[name] for name in ("words", "with a box", "boxes")} == {
-        "words": 3, "with a box": 2, "boxes": 3,
-    }  # fmt: skip
-    assert last().path == tmp_path / "report.html"
-
-
-@pytest.mark.filterwarnings("ignore:.*words have no box")
 def test_the_page_of_the_demo_counts_words_and_what_the_basis_costs(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(demo, "HtmlReport", Page)
     features = SCENE.features["names"]
     fusion = Fusion(features=features, views=(0,), depth_sources=(), config=FuseConfig(), teacher=PaletteTeacher())
-    made = TeacherResult(
+    made = demo.TeacherResult(
         title="names", words=("mug", "table", "lamp"), ious=(0.9, 0.4, 0.0), fusion=fusion, localization=found()
     )
-    demo.write_report(tmp_path / "a.html", SCENE, [made], summary_of())
+    demo.write_report(tmp_path / "a.html", SCENE, [made], summary_of(views=8))
     facts = last().told
     assert (facts["names localized"], facts["Gaussians"], facts["views"]) == ("1 of 3", len(KINDS), 8)
     assert facts["seconds before this page"] == 3.5
@@ -221,33 +165,18 @@ def test_the_page_of_the_demo_counts_words_and_what_the_basis_costs(
     assert last().tables[1][0]["centered cosine error"] == 0.0
 
 
+@pytest.mark.filterwarnings("ignore:.*words have no box")
 def test_a_teacher_counts_what_overlaps_by_half_or_more() -> None:
     features = SCENE.features["names"]
-    weights = features.weights.copy()
-    weights[:7] = 0
-    fusion = Fusion(
-        features=replace(features, weights=weights),
-        views=(0,),
-        depth_sources=(),
-        config=FuseConfig(),
-        teacher=PaletteTeacher(),
-    )
-    localization = Localization(
-        queries=(),
-        relevancy=np.zeros((0, len(KINDS)), np.float32),
-        thresholds=np.zeros(0, np.float32),
-        probabilities=np.zeros(0, np.float32),
-        boxes=(),
-    )
-    made = TeacherResult(
-        title="names", words=("a", "b", "c"), ious=(0.5, 0.49, 1.0), fusion=fusion, localization=localization
+    fusion = Fusion(features=features, views=(0,), depth_sources=(), config=FuseConfig(), teacher=PaletteTeacher())
+    made = demo.TeacherResult(
+        title="names", words=("a", "b", "c"), ious=(0.5, 0.49, 1.0), fusion=fusion, localization=found()
     )
     assert made.num_localized == 2
     assert made.to_dict() == {
-        "rank": 8, "channels": 8, "seen": len(KINDS) - 7, "mean_iou": pytest.approx(1.99 / 3),
+        "rank": 8, "channels": 8, "seen": len(KINDS), "mean_iou": pytest.approx(1.99 / 3),
         "iou": {"a": 0.5, "b": 0.49, "c": 1.0},
     }  # fmt: skip
-    assert replace(made, words=(), ious=()).mean_iou == 0
 
 
 UNSAFE = "<script>alert(1)<"
@@ -281,8 +210,24 @@ def test_fusion_words_and_scores_have_pages_in_which_names_are_text(tmp_path: Pa
     assert set(names) & set(rows)
 
 
-def test_without_the_option_there_is_no_page(tmp_path: Path) -> None:
-    made = make_room(1, views=2, width=60, height=45)
-    write_room(made, tmp_path / "room")
-    assert cli.main(["fuse", str(tmp_path / "room"), "teacher=palette", f"out={tmp_path / 'f'}", "quiet=true"]) == 0
-    assert not (tmp_path / "f" / "report.html").exists()
+SMALL = ("demo", "objects=2", "views=2", "width=64")
+
+
+def test_the_report_links_to_the_page_where_there_is_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def built() -> Bundle:
+        return Bundle(script="/* the script */", style="")
+
+    def unbuilt() -> Bundle:
+        raise InputError("view: the page's script is missing")
+
+    for name, load in (("with", built), ("without", unbuilt)):
+        monkeypatch.setattr("gsencoder.app.commands.demo.load_bundle", load)
+        assert cli.main([*SMALL, f"out={tmp_path / name}"]) == 0
+        output = capsys.readouterr().out
+        assert (tmp_path / name / "page.html").is_file() == (load is built)
+        assert ('<a href="page.html">' in (tmp_path / name / "report.html").read_text()) == (load is built)
+        assert ("page.html is left out: view: the page's script is missing" in " ".join(output.split())) == (
+            load is unbuilt
+        )

@@ -15,7 +15,6 @@ from gsencoder.app.commands import fuse
 from gsencoder.app.options import SharedScenesConfig
 from gsencoder.app.output import Summary, output_folder
 from gsencoder.app.run import Run
-from gsencoder.app.summary import report_budget, report_choice
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.data.scenes import find_scenes, listed_paths
 from gsencoder.reconstruct.sfm import find_photographed
@@ -94,10 +93,10 @@ def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Pa
 def test_a_broken_limit_of_one_of_several_scenes_names_it_on_the_screen_and_stands_in_its_summary_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def run_one(path: Path, out: Path, one: Summary) -> None:
+    def run_one(path: Path, out: Path, one: Run) -> None:
         with output_folder(out, summary=one):
-            report_choice(one, path.name, {}, predicted={}, notes=[], quiet=True)
-            report_budget(one, fuse.FusionBudget(seconds=1.0), {"seconds": 1.5 if path.name == "one" else 2.5})
+            one.report_choice(path.name, {}, predicted={}, notes=[])
+            one.report_budget(fuse.FusionBudget(seconds=1.0), {"seconds": 1.5 if path.name == "one" else 2.5})
 
     def run(config: fuse.FuseCommandConfig, run: Run) -> None:
         run.scenes([*map(Path, config.paths)], "features", run_one)
@@ -195,28 +194,6 @@ def test_folders_of_photographs_alone_are_reconstructed_beside_scenes(tmp_path: 
     (tmp_path / "all" / "notes").mkdir()
     chosen = find_photographed([str(tmp_path / "all")])
     assert [path.name for path in chosen] == ["nested", "plain", "scene"]
-
-
-def test_a_broken_scene_does_not_stop_the_others_on_the_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("one", "two"):
-        write_box(tmp_path / "scenes" / name, box_views(box_cameras(3, width=64, height=48, focal=45.0)))
-    broken = tmp_path / "scenes" / "one" / "transforms.json"
-    good = broken.read_text()
-    broken.write_text(good.replace("file_path", "path"))
-    command = ["fuse", str(tmp_path / "scenes"), "teacher=palette", f"out={tmp_path / 'out'}", "worker=0"]
-    assert cli.main(command) == 2
-    assert "1 of 2 scenes failed" in capsys.readouterr().err
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["two"]
-    broken.write_text(good)
-    before = (tmp_path / "out" / "two" / "summary.json").stat().st_mtime_ns
-    # Two workers in one command, of which the second has nothing left to do.
-    assert cli.main([*command[:-1], "-m", "worker=0,1"]) == 0
-    assert "2 of 2 scenes were finished before" in capsys.readouterr().out
-    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"one", "two"}
-    assert (tmp_path / "out" / "two" / "summary.json").stat().st_mtime_ns == before
-    assert json.loads((tmp_path / "out" / "one" / "summary.json").read_text())["results"]["views"] == 3
 
 
 @pytest.mark.slow

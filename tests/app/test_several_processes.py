@@ -1,8 +1,5 @@
 """Commands that several processes of a launcher start: those that share no work refuse, and write nothing."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -39,18 +36,3 @@ def test_one_scene_is_not_for_several_processes(
     assert "room: runs in one process, and this is process 1 of 3" in line
     assert "give several scenes, which processes share" in line
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.alone
-def test_two_processes_of_questions_write_nothing(tmp_path: Path) -> None:
-    write_room(make_room(0, objects=2, views=2, width=80, height=60), tmp_path / "room")
-    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    command = [*launcher, "-m", "gsencoder", "questions", str(tmp_path / "room"), f"out={tmp_path / 'out'}"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, check=False, timeout=120, env=environment, capture_output=True, text=True)
-    assert done.returncode != 0
-    # The launcher stops the others once one has refused, maybe before their own line.
-    assert "error: questions: runs in one process, and this is process " in done.stderr
-    assert " of 2 that a launcher (torchrun, SLURM) started; start it once" in done.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["room"]

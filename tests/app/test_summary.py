@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from output_folders import names
 
 from gsencoder.app.output import SUMMARY_NAME, Summary, output_folder, peak_memory_mb
 from gsencoder.core.errors import SceneWarning
@@ -29,7 +28,7 @@ def test_numpy_values_paths_and_dataclasses_are_written_as_json(tmp_path: Path) 
         "bool": np.bool_(True),
         "half": np.float16(0.5),
         "thing": Thing(path=Path("a/b"), size=np.float32(0.5)),
-        "tuple": (1, None, "é"),
+        "tuple": (1, None, os.fsdecode(b"a\xff")),
         3: [],
     }
     write_json(tmp_path / "a.json", value)
@@ -39,7 +38,7 @@ def test_numpy_values_paths_and_dataclasses_are_written_as_json(tmp_path: Path) 
         "bool": True,
         "half": 0.5,
         "thing": {"path": "a/b", "size": 0.5},
-        "tuple": [1, None, "é"],
+        "tuple": [1, None, "a\udcff"],
         "3": [],
     }
 
@@ -51,17 +50,6 @@ def test_numbers_that_are_not_finite_become_null_and_are_named(tmp_path: Path) -
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": [1.0, None], "c": [[0.0, None]]}
 
 
-def test_what_json_has_nothing_for_is_named(tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match=r"a\.0: set cannot be written as JSON"):
-        write_json(tmp_path / "a.json", {"a": [{1}]})
-    assert names(tmp_path) == []
-
-
-def test_a_file_name_that_is_not_utf8_can_be_written_down(tmp_path: Path) -> None:
-    write_json(tmp_path / "a.json", {"path": os.fsdecode(b"a\xff")})
-    assert json.loads((tmp_path / "a.json").read_bytes()) == {"path": "a\udcff"}
-
-
 def test_a_summary_records_what_the_run_did(tmp_path: Path) -> None:
     summary = Summary("fuse", {"out": Path("x"), "voxel": 0.02})
     for _ in range(2):
@@ -69,26 +57,20 @@ def test_a_summary_records_what_the_run_did(tmp_path: Path) -> None:
             time.sleep(0.01)
     with pytest.raises(ValueError), summary.step("fail"):
         raise ValueError
+    summary.add_seconds({"fuse": 0.5, "seeds": 1.0})
     summary.results["miou"] = math.nan
     summary.warnings.append("3 images were left out")
     with output_folder(tmp_path / "out", summary=summary):
         pass
     record = json.loads((tmp_path / "out" / SUMMARY_NAME).read_text())
     assert [record[key] for key in ("command", "settings")] == ["fuse", {"out": "x", "voxel": 0.02}]
-    assert 0.02 <= record["timings"]["fuse"] <= record["timings"]["total"] < 5
-    assert list(record["timings"]) == ["fuse", "fail", "total"]
+    assert 0.52 <= record["timings"]["fuse"] < 5
+    assert list(record["timings"]) == ["fuse", "fail", "seeds", "total"]
     assert record["results"] == {"miou": None}
     assert record["non_finite"] == ["results.miou"]
     assert record["warnings"] == ["3 images were left out"]
     assert record["versions"]["numpy"] == np.__version__
     assert set(record) >= {"version", "peak_memory_mb", "platform"}
-
-
-def test_seconds_that_were_timed_elsewhere_are_added_up() -> None:
-    summary = Summary("reconstruct", {})
-    for steps in ({"read": 2.0, "seeds": 1.0}, {"read": 0.5}):
-        summary.add_seconds(steps)
-    assert summary.timings == {"read": 2.5, "seeds": 1.0}
 
 
 def test_a_summary_names_neither_the_machine_nor_the_user(tmp_path: Path) -> None:

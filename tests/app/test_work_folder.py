@@ -44,15 +44,6 @@ def test_state_is_kept_when_a_run_is_cut_off_and_goes_when_it_ends(tmp_path: Pat
     assert not path.exists()
 
 
-def test_a_run_that_begins_anew_forgets_what_there_was(tmp_path: Path) -> None:
-    cut_off(tmp_path / "run", "state")
-    (tmp_path / "run" / "folder").mkdir()
-    (tmp_path / "run" / "folder" / "deep").touch()
-    with WorkFolder(tmp_path / "run") as work:
-        work.take(resume=False)
-        assert contents(tmp_path / "run") == [MARKER_FILE]
-
-
 @pytest.mark.parametrize("anew", [True, False])
 def test_a_state_that_a_kill_left_half_removed_is_not_continued(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, anew: bool
@@ -77,24 +68,16 @@ def test_a_state_that_a_kill_left_half_removed_is_not_continued(
     assert contents(path) == ["checkpoint", MARKER_FILE]
 
 
-def test_a_folder_that_was_not_taken_is_left_alone(tmp_path: Path) -> None:
-    cut_off(tmp_path / "run", "state")
-    with WorkFolder(tmp_path / "run"):
-        pass
-    assert contents(tmp_path / "run") == ["state", MARKER_FILE]
-
-
-@pytest.mark.parametrize("anew", [True, False])
-def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path, *, anew: bool) -> None:
+def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     with pytest.raises(InputError, match="holds something else"), WorkFolder(tmp_path) as work:
-        work.take(resume=not anew)
+        work.take(resume=True)
     assert (tmp_path / "notes.txt").is_file()
     with (
         pytest.raises(InputError, match="cannot save the state of this run here.*give another out="),
         WorkFolder(tmp_path / "notes.txt") as work,
     ):
-        work.take(resume=not anew)
+        work.take(resume=True)
 
 
 @pytest.mark.parametrize(("message", "noted"), [("no labels", True), ("{path} has other settings", False)])
@@ -114,13 +97,12 @@ def test_an_error_that_is_not_about_the_state_says_that_it_can_be_continued(
     assert any("continues it" in note for note in getattr(caught.value, "__notes__", ())) == noted
 
 
-@pytest.mark.parametrize("anew", [True, False])
-def test_a_run_that_was_killed_in_its_first_moments_does_not_block_the_next(tmp_path: Path, *, anew: bool) -> None:
+def test_a_run_that_was_killed_in_its_first_moments_does_not_block_the_next(tmp_path: Path) -> None:
     path = tmp_path / "run"
     path.mkdir()
     (path / f".{MARKER_FILE}.0123456789ab.tmp").touch()
     with WorkFolder(path) as work:
-        work.take(resume=not anew)
+        work.take(resume=True)
     assert not path.exists()
 
 
@@ -144,23 +126,15 @@ def test_a_kill_while_the_folder_is_removed_leaves_one_that_is_known(
     assert not path.exists()
 
 
-@pytest.mark.parametrize("anew", [True, False])
-def test_two_runs_do_not_share_a_folder(tmp_path: Path, *, anew: bool) -> None:
+def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
     with WorkFolder(tmp_path / "run") as first:
         first.take(resume=True)
         (first.path / "state").touch()
         with pytest.raises(InputError, match="another run saves its state here now"), WorkFolder(first.path) as second:
-            second.take(resume=not anew)
+            second.take(resume=True)
         assert contents(first.path) == ["state", MARKER_FILE]
     with WorkFolder(tmp_path / "run") as third:
         third.take(resume=True)
-
-
-def test_behind_a_link_the_folder_itself_is_emptied(tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "run").symlink_to(tmp_path / "elsewhere")
-    cut_off(tmp_path / "run", "state")
-    assert cut_off(tmp_path / "run", anew=True) == [MARKER_FILE]
 
 
 @pytest.mark.parametrize("anew", [True, False])

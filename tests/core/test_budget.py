@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from gsencoder.app.output import Summary
-from gsencoder.app.summary import report_budget, report_choice
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.run import Run
 from gsencoder.core.budget import (
     PLANNED,
     Budget,
@@ -121,20 +121,14 @@ def test_options_that_a_budget_chooses_are_refused_where_they_are_set_and_only_w
 
 
 def test_a_limit_that_is_kept_has_a_line_one_that_is_broken_a_warning_and_one_that_is_not_measured_says_so() -> None:
-    summary = Summary("encode", {})
+    summary = Run("encode", CommonConfig())
+    predicted = {"error": float("nan"), "seconds": 1.9}
     with pytest.warns(SceneWarning, match="^error first$"):
-        report_choice(
-            summary,
-            "room",
-            {"rank": 4},
-            predicted={"error": float("nan"), "seconds": 1.9},
-            notes=["error first"],
-            quiet=True,
-        )
+        summary.report_choice("room", {"rank": 4}, predicted=predicted, notes=["error first"])
     assert summary.results["budget"] == {"chosen": {"rank": 4}, "predicted": {"seconds": 1.9}, "notes": ["error first"]}
     budget = FullBudget(error=0.25, seconds=2.0, megabytes=1.0)
     with pytest.warns(SceneWarning, match="^budget.seconds: the limit is 2, and it became 2.001$") as caught:
-        lines = report_budget(summary, budget, {"seconds": 2.001, "megabytes": 1.0})
+        lines = summary.report_budget(budget, {"seconds": 2.001, "megabytes": 1.0})
     assert len(caught) == 1
     assert lines == [
         "budget.error: limit 0.25, not measured (budget.check=false)",

@@ -58,7 +58,7 @@ def test_the_command_writes_the_memory_of_one_space(tmp_path: Path, capsys: pyte
     save_memories(tmp_path / "memory", scene, {"first": one, "second": other})
     words = ["export", f"memory={tmp_path / 'memory'}"]
     assert cli.main([*words, f"out={tmp_path / 'm.onnx'}"]) == 2
-    assert "space: the folder has memories of first, second; name one of them" in capsys.readouterr().err
+    assert "space: there are features of first, second; name one of them" in capsys.readouterr().err
     assert cli.main([*words, "space=second", f"out={tmp_path / 'm.onnx'}"]) == 0
     assert "features of 24 channels from queries of 6" in capsys.readouterr().out
     session = onnxruntime.InferenceSession(str(tmp_path / "m.onnx"), providers=["CPUExecutionProvider"])

@@ -1,13 +1,17 @@
 """`gsencoder demo`: the pipeline on a built-in scene, offline, with an HTML report."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gsencoder.app.commands.localize import add_words
 from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.reports import TeacherResult, write_report
+from gsencoder.app.output import peak_memory_mb
+from gsencoder.app.reports import add_features, add_views
 from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_bytes, write_json
@@ -18,18 +22,51 @@ from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import color_words, make_room, write_room
 from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
-from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.infer.draw import write_boxes_ply
 from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
 from gsencoder.infer.page.page import FileOptions, fitting_page, load_bundle
+from gsencoder.infer.page.report import HtmlReport
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import text_table_of
 from gsencoder.teachers.labels import LabelsTeacher, PaletteConfig, PaletteTeacher
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
-from gsencoder.types import Scene, SceneObject
+from gsencoder.types import Localization, Scene, SceneObject
 
 PAGE = "page.html"
 PAGE_OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=16, photograph_side=640)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TeacherResult:
+    """The features of a teacher and the words that were localized in them; `ious` are those of the first box of each
+    word with the true one, 0 without a box."""
+
+    title: str
+    words: tuple[str, ...]
+    ious: tuple[float, ...]
+    fusion: Fusion
+    localization: Localization
+
+    @property
+    def num_localized(self) -> int:
+        """Number of words whose first box has an IoU of 0.5 or more."""
+        return sum(iou >= 0.5 for iou in self.ious)
+
+    @property
+    def mean_iou(self) -> float:
+        return float(np.mean(self.ious)) if self.ious else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """For summary.json."""
+        features = self.fusion.features
+        return {
+            "rank": features.features.shape[1],
+            "channels": features.space.channels,
+            "seen": int(features.seen.sum()),
+            "mean_iou": self.mean_iou,
+            "iou": dict(zip(self.words, self.ious, strict=True)),
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +99,7 @@ def run(config: DemoConfig, run: Run) -> None:
         palette, colors = PaletteTeacher(), text_table_of(PaletteConfig())
         assert colors is not None
         hues = color_words(config.seed, objects=config.objects)
-        by_name = [(scene_object.name, scene_object) for scene_object in scene_objects if scene_object.name]
+        by_name = [(scene_object.name or "", scene_object) for scene_object in scene_objects]
         by_color = [(hues[scene_object.id], scene_object) for scene_object in scene_objects]
         results = (
             search(scene, labels, names, by_name, config, folder / "names", run),
@@ -70,9 +107,9 @@ def run(config: DemoConfig, run: Run) -> None:
         )
         for result in results:
             run.print(
-                f"{result.title}: features of {result.features.features.shape[1]} of "
-                f"{result.features.space.channels} channels; {result.num_localized} of {len(result.words)} words "
-                f"localized (IoU ≥ 0.5), mean IoU {result.mean_iou:.2f}"
+                f"{result.title}: features of {result.to_dict()['rank']} of {result.to_dict()['channels']} channels; "
+                f"{result.num_localized} of {len(result.words)} words localized (IoU ≥ 0.5), mean IoU "
+                f"{result.mean_iou:.2f}"
             )
         run.results.update(
             gaussians=len(scene.gaussians),
@@ -95,7 +132,7 @@ def write_page(path: Path, scene: Scene, result: TeacherResult, words: TextTable
         bundle = load_bundle()
     except InputError as error:
         return str(error)
-    page_scene = replace(scene, features={result.features.space.name: result.features})
+    page_scene = replace(scene, features={result.fusion.features.space.name: result.fusion.features})
     page = fitting_page(
         bundle,
         [(page_scene, result.title, words)],
@@ -167,3 +204,49 @@ def search(
     return TeacherResult(
         title=title, words=tuple(word for word, _ in pairs), ious=tuple(ious), fusion=fusion, localization=localization
     )
+
+
+TEXTS = {
+    "names": (
+        "Where is each object?",
+        "The labels teacher paints each pixel with the vector of its object's name. The vectors are "
+        "lifted from all views onto the Gaussians; a word selects Gaussians by cosine, and DBSCAN clusters them to "
+        "boxes.",
+    ),
+    "colors": (
+        "Where is each color?",
+        "The palette teacher looks at the photographs alone and names colors. A color on a wall or on the "
+        "furniture is localized too: the best box is not always the small object that was meant.",
+    ),
+}
+
+
+def write_report(path: Path, scene: Scene, results: Sequence[TeacherResult], run: Run, *, page: str = "") -> None:
+    """Draws the pictures and writes the report, with a link to a page beside it if there is one."""
+    assert scene.gaussians is not None
+    report = HtmlReport(
+        "A room and the words in it",
+        "Gaussians were seeded from posed pictures with depth, 2D features lifted onto them, and words localized.",
+    )
+    report.facts(
+        {
+            "Gaussians": len(scene.gaussians),
+            "views": run.results["views"],
+            "seconds before this page": sum(run.timings.values()),
+            "peak memory, MiB": peak_memory_mb(),
+            **{f"{result.title} localized": f"{result.num_localized} of {len(result.words)}" for result in results},
+        }
+    )
+    if page:
+        report.section("In a browser")
+        report.link("The room as a page: type a word, and see it", page)
+    features = {result.title: result.fusion.features for result in results}
+    add_views(report, scene, features)
+    for result in results:
+        report.section(*TEXTS[result.title])
+        add_words(report, scene, result.localization, dict(zip(result.words, result.ious, strict=True)))
+    report.section("Seconds of each step")
+    report.timings(run.timings)
+    report.section("Features")
+    add_features(report, features, {result.title: result.fusion.truncation for result in results})
+    report.write(path)

@@ -2,17 +2,14 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from gsencoder.app.options import SharedScenesConfig, settings, typed
-from gsencoder.app.output import Summary
 from gsencoder.app.run import Run
-from gsencoder.app.scenes import with_reported_up
-from gsencoder.app.summary import basis_figures, describe_basis, report_budget, report_choice
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
@@ -23,6 +20,8 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
+from gsencoder.data.up import with_up
+from gsencoder.fusion.basis import basis_figures, describe_basis
 from gsencoder.fusion.folder import (
     FEATURES_FILE,
     HEADS_FILE,
@@ -43,61 +42,6 @@ from gsencoder.infer.encode_budget import (
 )
 from gsencoder.models.output_space import teacher_of_space
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
-
-
-def encode_in_budget(
-    scene: Scene,
-    encoder: Encoder,
-    teachers: Sequence[str],
-    config: "EncodeCommandConfig",
-    made_with: Mapping[str, str],
-    run: Run,
-    *,
-    metres_per_unit: float,
-) -> BudgetEncoding:
-    """Chooses a setting and encodes; says which setting that is, and what is predicted of it."""
-    assert scene.gaussians is not None
-    # Of the settings, those that take the most bytes in the files.
-    longest = replace(exact_encoding(config.encode), precision="bfloat16")
-    encoding = encode_within(
-        scene.gaussians,
-        encoder,
-        teachers,
-        config.encode,
-        config.budget,
-        metres_per_unit=metres_per_unit,
-        header={"encode": settings(longest), **made_with},
-        track=run.track,
-    )
-    run.add_seconds({"choose": encoding.choosing, "encode": encoding.seconds - encoding.choosing})
-    setting, ranks = encoding.choice.setting, encoding.ranks
-    chosen: dict[str, Any] = {"precision": setting.precision, "halo": setting.halo}
-    chosen |= {"rank" if len(ranks) == 1 else f"rank of {name}": rank for name, rank in ranks.items()}
-    report_choice(run, scene.name, chosen, predicted=encoding.predicted, notes=encoding.notes, quiet=config.quiet)
-    return encoding
-
-
-def report_encoded(
-    encoding: BudgetEncoding,
-    scene: Scene,
-    encoder: Encoder,
-    files: Sequence[Path],
-    config: "EncodeCommandConfig",
-    run: Run,
-    *,
-    metres_per_unit: float,
-) -> list[str]:
-    """Measures what is limited; returns a line for each limit, and warns of those that are broken."""
-    assert scene.gaussians is not None
-    budget = config.budget
-    measured = {"seconds": encoding.seconds, "megabytes": sum(file.stat().st_size for file in files) / MEGABYTE}
-    if budget.error is not None and budget.check:
-        with run.step("check"):
-            errors = realised_error(
-                encoding, scene.gaussians, encoder, metres_per_unit=metres_per_unit, track=run.track
-            )
-        measured["error"] = max(error.total for error in errors.values())
-    return report_budget(run, budget, measured)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,7 +94,8 @@ def run(config: EncodeCommandConfig, run: Run) -> None:
             if scene.gaussians is None:
                 with run.step("seeds"):
                     scene = with_gaussians(scene, config.seeds, track=run.track)
-            scene = with_reported_up(scene, run)
+            scene, up = with_up(scene)
+            run.report_up(scene.name, up)
             assert scene.gaussians is not None
             count, chunk = len(scene.gaussians), config.encode.chunk
             if chunk and count > chunk:
@@ -176,40 +121,49 @@ def run(config: EncodeCommandConfig, run: Run) -> None:
 def _warn_of_missing(encoder: Encoder, file: Path, heads: Path | None, spaces: tuple[str, ...]) -> None:
     """Warns of adapter heads and words that do not lie beside the weights that were trained with them."""
     trained_with = encoder.made_by.get("settings", {}).get("heads") or ()
+    missing = []
     if heads is None and trained_with:
-        warnings.warn(
-            f"weights: the adapter heads {', '.join(trained_with)} that the encoder was trained with do not lie "
-            f"beside {file}; head= will not work with its features",
-            SceneWarning,
-            stacklevel=2,
+        missing.append(
+            f"the adapter heads {', '.join(trained_with)} that the encoder was trained with do not lie beside {file}; "
+            "head= will not work with its features"
         )
     for name in requested_teachers(encoder, spaces):
         if encoder.spaces[name].text_encoder and name not in encoder.tables:
-            warnings.warn(
-                f"weights: no words of {encoder.spaces[name].text_encoder} lie beside {file}, so the features of "
-                f"{name} have none; `localize` needs words= or text=",
-                SceneWarning,
-                stacklevel=2,
+            missing.append(
+                f"no words of {encoder.spaces[name].text_encoder} lie beside {file}, so the features of {name} have "
+                "none; `localize` needs words= or text="
             )
+    for each in missing:
+        warnings.warn(f"weights: {each}", SceneWarning, stacklevel=2)
 
 
 def _encode_into(
-    folder: Path,
-    scene: Scene,
-    encoder: Encoder,
-    config: EncodeCommandConfig,
-    made_with: Mapping[str, str],
-    run: Run,
+    folder: Path, scene: Scene, encoder: Encoder, config: EncodeCommandConfig, made_with: Mapping[str, str], run: Run
 ) -> tuple[list[FeatureSpace], list[str]]:
     """Encodes a scene and writes its features and words, and what they were made with; returns the spaces that were
     written, and a line for each limit."""
     assert scene.gaussians is not None
-    unit = unit_of(scene, encoder.voxel)
+    unit, budget = unit_of(scene, encoder.voxel), config.budget
     teachers = requested_teachers(encoder, config.spaces)
     budgeted: BudgetEncoding | None = None
-    if config.budget.limits:
-        budgeted = encode_in_budget(scene, encoder, teachers, config, made_with, run, metres_per_unit=unit)
-        by_teacher, encoding = budgeted.features, budgeted.choice.setting
+    if budget.limits:
+        # Of the settings, those that take the most bytes in the files.
+        longest = replace(exact_encoding(config.encode), precision="bfloat16")
+        budgeted = encode_within(
+            scene.gaussians,
+            encoder,
+            teachers,
+            config.encode,
+            budget,
+            metres_per_unit=unit,
+            header={"encode": settings(longest), **made_with},
+            track=run.track,
+        )
+        run.add_seconds({"choose": budgeted.choosing, "encode": budgeted.seconds - budgeted.choosing})
+        by_teacher, encoding, ranks = budgeted.features, budgeted.choice.setting, budgeted.ranks
+        chosen: dict[str, Any] = {"precision": encoding.precision, "halo": encoding.halo}
+        chosen |= {"rank" if len(ranks) == 1 else f"rank of {name}": rank for name, rank in ranks.items()}
+        run.report_choice(scene.name, chosen, predicted=budgeted.predicted, notes=budgeted.notes)
     else:
         with run.step("encode"):
             by_teacher = encoder.encode_spaces(scene.gaussians, config.encode, metres_per_unit=unit, track=run.track)
@@ -217,23 +171,28 @@ def _encode_into(
     if config.basis_views and all(each.basis is None for each in by_teacher.values()):
         raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
     single = len(by_teacher) == 1
-    figures = {}
-    for name, features in by_teacher.items():
-        file = file_of_teacher(FEATURES_FILE, None if single else name)
-        figures[name] = {
+    figures = {
+        name: {
             "channels": features.space.channels,
             "rank": features.features.shape[1],
             "basis": _basis_figures(scene, name, features, encoder, config, run),
             "space": features.space.describe(),
-            "features": file,
+            "features": file_of_teacher(FEATURES_FILE, None if single else name),
         }
+        for name, features in by_teacher.items()
+    }
     with run.step("write"):
         save_features(folder, scene, by_teacher, {"encode": settings(encoding), **made_with})
         save_tables(folder, {name: encoder.tables[name] for name in by_teacher if name in encoder.tables}, by_teacher)
     lines = []
     if budgeted is not None:
-        files = [folder / str(each["features"]) for each in figures.values()]
-        lines = report_encoded(budgeted, scene, encoder, files, config, run, metres_per_unit=unit)
+        sizes = [(folder / str(each["features"])).stat().st_size for each in figures.values()]
+        measured = {"seconds": budgeted.seconds, "megabytes": sum(sizes) / MEGABYTE}
+        if budget.error is not None and budget.check:
+            with run.step("check"):
+                errors = realised_error(budgeted, scene.gaussians, encoder, metres_per_unit=unit, track=run.track)
+            measured["error"] = max(error.total for error in errors.values())
+        lines = run.report_budget(budget, measured)
     first = next(iter(by_teacher.values()))
     run.results.update(
         gaussians=len(first),
@@ -253,12 +212,12 @@ def requested_teachers(encoder: Encoder, names: tuple[str, ...]) -> list[str]:
 
 
 def _basis_figures(
-    scene: Scene, name: str, features: GaussianFeatures, encoder: Encoder, config: EncodeCommandConfig, summary: Summary
+    scene: Scene, name: str, features: GaussianFeatures, encoder: Encoder, config: EncodeCommandConfig, run: Run
 ) -> dict[str, int | float]:
     """The figures of a basis, of this scene with `basis_views`, else of the scenes held out of the training."""
     figures = basis_figures(features.basis, features.features.shape[1])
     if config.basis_views and features.basis is not None:
-        with summary.step("basis"), about(f"teacher {name}") if len(encoder.spaces) > 1 else nullcontext():
+        with run.step("basis"), about(f"teacher {name}") if len(encoder.spaces) > 1 else nullcontext():
             return figures | _figures_of_scene(scene, name, features.basis, encoder, config.basis_views)
     stored = encoder.made_by.get("basis", {})
     stored = stored.get(name, stored)

@@ -51,7 +51,7 @@ from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.teachers.build import TeacherConfig, load_teacher_heads, words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, with_training_names, words_of_table
-from gsencoder.train.distributed import fail_together, value_of_first, values_of_all
+from gsencoder.train.distributed import fail_together, join_processes, value_of_first, values_of_all
 from gsencoder.types import QueryMemory, Scene
 
 AnyProtocol = (
@@ -121,7 +121,7 @@ def run(config: EvaluateConfig, run: Run) -> None:
     method = "encoded" if config.weights else "fused"
     if config.features:
         method = Path(config.features).resolve().name
-    with run.processes("cpu", out) as group:
+    with run.processes(join_processes, "cpu", out) as group:
         process, folder = group.process, None
         with fail_together():
             folder = group.folder()

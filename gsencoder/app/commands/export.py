@@ -16,10 +16,11 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.folder import copy_heads, find_heads, heads_of_graph, load_memories
-from gsencoder.infer.encode import COSINE, TOLERANCE, Cloud, Encoder, check_cosines, check_parity, file_of_encoder
+from gsencoder.infer.encode import Cloud, Encoder, check_cosines, check_parity, file_of_encoder
 from gsencoder.infer.onnx.export import export_onnx, random_cloud
 from gsencoder.infer.onnx.runtime import SUFFIX
 from gsencoder.memory.attention import export_memory
+from gsencoder.models.output_space import teacher_of_space
 from gsencoder.types import QueryMemory
 
 MAX_SIZE = 10_000_000
@@ -55,16 +56,6 @@ class ExportConfig(CommonConfig):
     )
     sizes: tuple[int, ...] = option(
         (1, 2, 31, 1000, 20000), "numbers of Gaussians of the random clouds for the comparison", ge=1, le=MAX_SIZE
-    )
-    tolerance: float = option(
-        TOLERANCE, "largest difference of the float32 graph from torch, as a share of the largest output", gt=0, lt=1
-    )
-    cosine: float = option(
-        COSINE,
-        "smallest mean centered cosine of another precision's features to float32's, on each SPLAT, or on "
-        "each random cloud where there is none",
-        ge=-1,
-        le=1,
     )
     splat: str = option("", f"Gaussians of scenes; empty = seeds. {READABLE}")
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -106,7 +97,7 @@ def run(config: ExportConfig, run: Run) -> None:
         lowered = network.lower()
         exact = model = export_onnx(network.header, lowered)
     with run.step("compare"):
-        parity = check_parity(exact, encoder, [*clouds, *scenes], tolerance=config.tolerance, track=run.track)
+        parity = check_parity(exact, encoder, [*clouds, *scenes], track=run.track)
     agreement = f"within {max(parity.values()):.1g} of torch's largest output"
     cosines: dict[str, float] = {}
     if config.precision != "float32":
@@ -115,7 +106,7 @@ def run(config: ExportConfig, run: Run) -> None:
                 lowered = network.lower(half=True)
             model = export_onnx(replace(network.header, precision=config.precision), lowered)
         with run.step("judge"):
-            cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=run.track)
+            cosines = check_cosines(model, exact, scenes or clouds, track=run.track)
         agreement = (
             f"{config.precision}, {len(model) / len(exact):.2f} of float32's size, mean centered cosine to it "
             f"{min(cosines.values()):.4f} or more"
@@ -166,20 +157,13 @@ def _export_memory(config: ExportConfig, out: Path, run: Run) -> None:
 
 def _memory_of(memories: Mapping[str | None, QueryMemory], space: str) -> QueryMemory:
     """The memory of a teacher, by its name in the folder or that of its feature space."""
-    if not space and len(memories) == 1:
-        return next(iter(memories.values()))
-    by_name = {name or memory.space.name: memory for name, memory in memories.items()}
-    for memory in memories.values():
-        by_name.setdefault(memory.space.name, memory)
-    if space not in by_name:
-        names = ", ".join(name or memory.space.name for name, memory in memories.items())
-        hint = f"expected one of them, got {space!r}" if space else "name one of them"
-        raise InputError(f"space: the folder has memories of {names}; {hint}")
-    return by_name[space]
+    spaces = {name or memory.space.name: memory.space for name, memory in memories.items()}
+    name = teacher_of_space(spaces, space or None)
+    return next(memory for memory in memories.values() if memory.space == spaces[name])
 
 
 def space_figures(encoder: Encoder) -> dict[str, Any]:
-    """Channels, rank, words and space of an encoder; of each teacher by its name where there are several."""
+    """Channels, rank, words and space of an encoder, by teacher where there are several."""
     figures = {
         name: {
             "channels": outputs.space.channels,

@@ -1,7 +1,7 @@
 """`gsencoder fuse SCENE… teacher=…`: per-Gaussian features from a teacher's maps of the views."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -11,9 +11,8 @@ import numpy as np
 
 from gsencoder.app.inputs import load_fusable
 from gsencoder.app.options import SharedScenesConfig, settings
-from gsencoder.app.output import Summary
+from gsencoder.app.reports import report_fusion
 from gsencoder.app.run import Run
-from gsencoder.app.summary import describe_basis, report_budget, report_choice
 from gsencoder.core.archive import LONGEST_SHARE
 from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.device import choose_device
@@ -23,6 +22,7 @@ from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
+from gsencoder.fusion.basis import describe_basis
 from gsencoder.fusion.budget import (
     BudgetFusion,
     FusionBudget,
@@ -37,7 +37,6 @@ from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.measured_heads import measure_heads, save_heads
 from gsencoder.models.output_space import OutputSpaces, load_output_spaces, name_of_space
-from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import (
     AutoConfig,
     TeacherConfig,
@@ -48,42 +47,9 @@ from gsencoder.teachers.build import (
     words_of,
 )
 from gsencoder.teachers.heads import Head
-from gsencoder.text.table import TextTable, save_text_table
+from gsencoder.text.table import save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
-
-
-def fuse_in_budget(
-    scene: Scene, teacher: Teacher, config: "FuseCommandConfig", header: Mapping[str, Any], run: Run, work: Path
-) -> BudgetFusion:
-    """Chooses a setting and fuses; says which setting that is, and what is predicted of it."""
-    with Clock().running() as clock:
-        fused = fuse_within(
-            scene,
-            teacher,
-            config.fusion,
-            config.budget,
-            header=header,
-            work=None if teacher.cheap else work,
-            device=config.device,
-            track=run.track,
-        )
-    run.add_seconds({"choose": fused.choosing, **clock.seconds})
-    chosen = {"views": len(fused.fusion.views), "rank": fused.fusion.features.features.shape[1]}
-    report_choice(run, scene.name, chosen, predicted=fused.predicted, notes=fused.notes, quiet=config.quiet)
-    return fused
-
-
-def report_fused(fused: BudgetFusion, scene: Scene, file: Path, config: "FuseCommandConfig", run: Run) -> list[str]:
-    """Measures what is limited; returns a line for each limit, and warns of those that are broken."""
-    budget = config.budget
-    measured = {"seconds": fused.seconds, "megabytes": file.stat().st_size / MEGABYTE}
-    if budget.error is not None and budget.check:
-        with run.step("check"):
-            error = realised_error(fused, scene, config.fusion, device=config.device, track=run.track)
-        measured["error"] = error.total
-        run.results["budget"]["covered"] = error.covered
-    return report_budget(run, budget, measured)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,6 +104,7 @@ def run(config: FuseCommandConfig, run: Run) -> None:
     outputs = load_output_spaces(config.basis, "basis") if config.basis else None
 
     def one(path: Path, out: Path, run: Run) -> None:
+        work = out.parent / f".{out.name}.fusing"  # maps and sums of an unfinished fusion
         with run.folder(out) as folder:
             scene = load_fusable(
                 path,
@@ -157,33 +124,37 @@ def run(config: FuseCommandConfig, run: Run) -> None:
                 run.results.update(teacher=settings(chosen.teacher), text=settings(chosen.text))
                 run.print(f"{scene.name}: {chosen.reason}; {chosen.describe()}")
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
-            in_budget: BudgetFusion | None = None
-            if config.budget.limits:
-                # Of the settings that are written, those that take the most bytes.
-                longest = replace(exact_config(config.fusion), energy=LONGEST_SHARE)
-                header = recipe(chosen.teacher, longest)
-                in_budget = fuse_in_budget(scene, teacher, config, header, run, work_folder(out))
-                fusion = in_budget.fusion
-            else:
-                work = None if teacher.cheap else work_folder(out)
-                with Clock().running() as clock:
-                    fusion = fuse(
-                        scene, teacher, config.fusion, basis=basis, work=work, device=config.device, track=run.track
-                    )
-                run.add_seconds(clock.seconds)
-            write_features(folder, scene, fusion, stored_words(teacher, chosen.words), chosen.teacher, run)
+            common: dict[str, Any] = {
+                "work": None if teacher.cheap else work,
+                "device": config.device,
+                "track": run.track,
+            }
+            budgeted: BudgetFusion | None = None
+            with Clock().running() as clock:
+                if config.budget.limits:
+                    # Of the settings that are written, those that take the most bytes.
+                    header = recipe(chosen.teacher, replace(exact_config(config.fusion), energy=LONGEST_SHARE))
+                    budgeted = fuse_within(scene, teacher, config.fusion, config.budget, header=header, **common)
+                    fusion = budgeted.fusion
+                else:
+                    fusion = fuse(scene, teacher, config.fusion, basis=basis, **common)
+            run.add_seconds(({"choose": budgeted.choosing} if budgeted is not None else {}) | clock.seconds)
+            if budgeted is not None:
+                made = {"views": len(fusion.views), "rank": fusion.features.features.shape[1]}
+                run.report_choice(scene.name, made, predicted=budgeted.predicted, notes=budgeted.notes)
+            with run.step("write"):
+                save_features(folder, scene, fusion.features, recipe(chosen.teacher, fusion.config))
+                if (words := stored_words(teacher, chosen.words)) is not None:
+                    save_text_table(folder / WORDS_FILE, words)
+            add_figures(fusion, run)
             if basis is not None and scene.views is not None:
                 run.results.update(project_maps(basis, fusion.teacher, scene.views, fusion.views).fit().figures())
-            lines = []
-            if in_budget is not None:
-                lines = report_fused(in_budget, scene, folder / FEATURES_FILE, config, run)
+            lines = report_limits(folder, scene, budgeted, config, run) if budgeted is not None else []
             lines += write_heads(folder, heads, scene, fusion, run)
             if config.report:
-                from gsencoder.app.reports import report_fusion
-
                 with run.step("report"):
                     report_fusion(folder, scene, fusion.features, fusion.truncation, chosen.teacher.name, run)
-        shutil.rmtree(work_folder(out), ignore_errors=True)
+        shutil.rmtree(work, ignore_errors=True)
         figures = run.results
         run.print(
             f"{out}: {figures['seen']:,} of {counted(figures['gaussians'], 'Gaussian')} have features, "
@@ -193,6 +164,18 @@ def run(config: FuseCommandConfig, run: Run) -> None:
         )
 
     run.scenes(paths, "features", one)
+
+
+def report_limits(folder: Path, scene: Scene, fused: BudgetFusion, config: FuseCommandConfig, run: Run) -> list[str]:
+    """Measures what is limited; returns a line for each limit, and warns of those that are broken."""
+    size = (folder / FEATURES_FILE).stat().st_size
+    measured = {"seconds": fused.seconds, "megabytes": size / MEGABYTE}
+    if config.budget.error is not None and config.budget.check:
+        with run.step("check"):
+            error = realised_error(fused, scene, config.fusion, device=config.device, track=run.track)
+        measured["error"] = error.total
+        run.results["budget"]["covered"] = error.covered
+    return run.report_budget(config.budget, measured)
 
 
 def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> FeatureBasis:
@@ -205,26 +188,15 @@ def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> Featu
     return basis
 
 
-def work_folder(out: Path) -> Path:
-    """The folder for the maps and sums of an unfinished fusion."""
-    return out.parent / f".{out.name}.fusing"
-
-
 def recipe(teacher: TeacherConfig, fusion: FuseConfig) -> dict[str, Any]:
     """The settings that are written with features."""
     return {"teacher": settings(teacher), "fusion": settings(fusion)}
 
 
-def write_features(
-    folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, teacher: TeacherConfig, summary: Summary
-) -> None:
-    """Writes features, scene and words, and adds the figures of the fusion to the summary."""
+def add_figures(fusion: Fusion, run: Run) -> None:
+    """Adds the figures of a fusion to the summary."""
     features = fusion.features
-    with summary.step("write"):
-        save_features(folder, scene, features, recipe(teacher, fusion.config))
-        if words is not None:
-            save_text_table(folder / WORDS_FILE, words)
-    summary.results.update(
+    run.results.update(
         gaussians=len(features),
         seen=int(features.seen.sum()),
         views=len(fusion.views),
@@ -239,15 +211,14 @@ def write_features(
     )
 
 
-def write_heads(folder: Path, heads: Sequence[Head], scene: Scene, fusion: Fusion, summary: Summary) -> list[str]:
-    """Measures adapter heads over the maps that were fused, writes them, and adds their figures to the summary; returns
-    a line for each head."""
+def write_heads(folder: Path, heads: Sequence[Head], scene: Scene, fusion: Fusion, run: Run) -> list[str]:
+    """Measures adapter heads over the maps that were fused and writes them; returns a line for each head."""
     if not heads:
         return []
     assert scene.views is not None
-    with summary.step("heads"):
+    with run.step("heads"):
         sample = sample_cells(fusion.teacher, scene.views, fusion.views)
         measured = measure_heads(heads, sample.vectors(), fusion.features.space, fusion.features.basis)
         save_heads(folder / HEADS_FILE, measured)
-    summary.results.update(heads=measured.figures())
+    run.results.update(heads=measured.figures())
     return measured.describe()

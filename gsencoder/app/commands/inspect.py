@@ -20,7 +20,6 @@ from gsencoder.core.files import write_picture
 from gsencoder.core.settings import option
 from gsencoder.data.check.agreement import agreement_map
 from gsencoder.data.check.epipolar import EpipolarCheck
-from gsencoder.data.check.findings import Finding
 from gsencoder.data.check.scene_check import DepthCheck
 from gsencoder.data.labels.mesh import MeshInstances
 from gsencoder.data.readers.label_images import LabelFiles
@@ -123,7 +122,7 @@ def _inspect_scene(path: Path, config: InspectConfig, run: Run, folder: Path | N
             depth, matches = check_scene(scene.views, limit=config.views, track=run.track)
         findings = findings_of(scene.views, depth, matches)
         lines += check_lines(facts, depth, matches)
-        lines += [f"wrong: {finding_line(finding)}" for finding in findings]
+        lines += [f"wrong: {f'view {each.view}: ' if each.view is not None else ''}{each.message}" for each in findings]
         if not findings and (depth is not None or matches is not None):
             lines.append("nothing wrong was seen" if is_decided(depth, matches) else "too little to tell")
         results["check"] = check_results(depth, matches)
@@ -164,17 +163,11 @@ def report_table(path: str, report: SplatReport) -> Table:
     return table
 
 
-def _corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[str, str]:
+def _corners(low: tuple[float, ...], high: tuple[float, ...]) -> list[str]:
     """The corners of a box, with four digits of its size also where it lies far from the origin."""
-    digits = []
-    for least, most in zip(low, high, strict=True):
-        largest, size = max(abs(least), abs(most)), most - least
-        # No float32 has more than nine.
-        digits.append(4 + min(max(math.ceil(math.log10(largest / size)), 0), 5) if 0 < size < largest else 4)
-    first, second = (
-        ", ".join(f"{value:.{count}g}" for value, count in zip(corner, digits, strict=True)) for corner in (low, high)
-    )
-    return f"({first})", f"({second})"
+    size = max(max(high[axis] - low[axis] for axis in range(3)), 1e-30)
+    decimals = max(3 - math.floor(math.log10(size)), 0)
+    return [f"({', '.join(f'{round(value, decimals):.9g}' for value in corner)})" for corner in (low, high)]
 
 
 MAX_ROWS = 4  # Views in the picture
@@ -185,13 +178,8 @@ GOOD, BAD, NOTHING = (44, 160, 44), (214, 39, 40), (64, 64, 64)
 
 
 def scene_facts(scene: Scene, posed: PosedImages, layout: str, up: Up | None) -> dict[str, Any]:
-    """What a loaded scene with views holds, as JSON values; some of its depth images are read.
-
-    Args:
-        posed: the same views as their files describe them.
-        layout: the name of the layout.
-        up: of the scene.
-    """
+    """What a loaded scene with views holds, as JSON values; some of its depth images are read. `posed` are the same
+    views as their files describe them."""
     views = scene.views
     assert views is not None
     cameras, names = views.cameras, set(views.names)
@@ -362,11 +350,6 @@ def check_lines(facts: dict[str, Any], depth: DepthCheck | None, matches: Epipol
     return lines
 
 
-def finding_line(finding: Finding) -> str:
-    """A finding as one line."""
-    return f"view {finding.view}: {finding.message}" if finding.view is not None else finding.message
-
-
 def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> dict[str, Any]:
     """The figures of the checks as JSON values."""
     results: dict[str, Any] = {}
@@ -380,22 +363,14 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
             "color_correlation": depth.color,
         }
         if depth.registration is not None:
-            results["registration"] = {
-                "focal_factor": depth.registration.focal_factor,
-                "shift": depth.registration.shift.tolist(),
-                "given": depth.registration.given,
-                "best": depth.registration.best,
-            }
+            fit = ("focal_factor", "shift", "given", "best")
+            results["registration"] = {name: getattr(depth.registration, name) for name in fit}
     if matches is not None:
         results["matches"] = {
             "views": len(matches.views),
-            "pairs": matches.pairs,
-            "matches": matches.matches,
-            "share": matches.share,
+            **{name: getattr(matches, name) for name in ("pairs", "matches", "share", "decided", "unmatched")},
             "error_pixels": matches.error,
             "best_error_pixels": matches.best_error,
-            "decided": matches.decided,
-            "unmatched": list(matches.unmatched),
         }
     return results
 

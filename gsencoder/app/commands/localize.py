@@ -19,8 +19,9 @@ from gsencoder.core.threads import import_ahead
 from gsencoder.data.readers.transforms_json import read_cameras
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.up import with_up
-from gsencoder.infer.draw import write_boxes_ply
+from gsencoder.infer.draw import color_bar, write_boxes_ply
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, localization_to_json, localize, words_to_json
+from gsencoder.infer.page.report import HtmlReport
 from gsencoder.text.table import TextEncoder
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Cameras, Localization, QueryMemory, Scene
@@ -91,7 +92,7 @@ def run(config: LocalizeCommandConfig, run: Run) -> None:
                 memory = None if config.head else memory_of(folder, queried)
                 absent, drawn = localization.absent, config.pictures > 0
                 for pose_points, pose_pictures in search_from_poses(
-                    queried, cameras, words, table, config.localize, absent=absent, memory=memory, pictures=drawn
+                    queried, *cameras, words, table, config.localize, absent=absent, memory=memory, pictures=drawn
                 ):
                     points += pose_points
                     for name, picture in pose_pictures:
@@ -99,8 +100,6 @@ def run(config: LocalizeCommandConfig, run: Run) -> None:
             write_json(target / FROM_POSE, points)
             run.results["from_pose"] = points
         if config.report:
-            from gsencoder.app.reports import report_words
-
             with run.step("report"):
                 report_words(target, scene, localization, run)
     for word in words:
@@ -126,39 +125,18 @@ def _first_box(localization: Localization, word: str) -> str:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RequestedCameras:
-    """Cameras that words are searched from.
-
-    Attributes:
-        cameras: relative to the scene's origin.
-        views: for each the name of the scene's view, or None for a camera of a file.
-    """
-
-    cameras: Cameras
-    views: tuple[str | None, ...]
-
-
-def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> RequestedCameras | None:
-    """The cameras of a file, followed by those of views of the scene; None where neither is asked for.
-
-    Args:
-        scene: whose views and origin they are.
-        pose: path of a JSON file in the form of `gsencoder.data.readers.transforms_json`, or empty.
-    """
-    parts, names = [], [*views]
-    in_file = 0
-    if pose:
-        parts.append(read_cameras(Path(pose), scene.origin))
-        in_file = len(parts[0])
-    if names:
-        row_of = {} if scene.views is None else {name: row for row, name in enumerate(scene.views.names)}
-        for name in names:
-            if name not in row_of:
-                some = f"its views are {listed(list(row_of))}" if row_of else "it has no views"
-                raise InputError(f"view: scene {scene.name} has no view {name[:80]!r}; {some}")
-        assert scene.views is not None
-        parts.append(scene.views.cameras.select([row_of[name] for name in names]))
+def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> tuple[Cameras, tuple[str | None, ...]] | None:
+    """The cameras of a file, followed by those of views of the scene, relative to its origin, and for each the name of
+    its view or None; None where neither is asked for."""
+    parts = [read_cameras(Path(pose), scene.origin)] if pose else []
+    names: list[str | None] = [None] * sum(map(len, parts))
+    row_of = {} if scene.views is None else {name: row for row, name in enumerate(scene.views.names)}
+    for name in views:
+        if scene.views is None or name not in row_of:
+            some = f"its views are {listed(list(row_of))}" if row_of else "it has no views"
+            raise InputError(f"view: scene {scene.name} has no view {name[:80]!r}; {some}")
+        parts.append(scene.views.cameras.select([row_of[name]]))
+        names.append(name)
     if not parts:
         return None
     cameras = Cameras(
@@ -167,12 +145,13 @@ def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> Requeste
         widths=np.concatenate([part.widths for part in parts]),
         heights=np.concatenate([part.heights for part in parts]),
     )
-    return RequestedCameras(cameras=cameras, views=(*(None,) * in_file, *names))
+    return cameras, tuple(names)
 
 
 def search_from_poses(
     scene: Scene,
-    cameras: RequestedCameras,
+    cameras: Cameras,
+    names: Sequence[str | None],
     words: Sequence[str],
     text: TextEncoder,
     config: LocalizeConfig,
@@ -184,59 +163,47 @@ def search_from_poses(
     """What each camera sees of the words: the points of the words as JSON values, and pictures with their names.
 
     Args:
-        scene: the scene with one feature set.
-        cameras: relative to its origin.
-        words: that `text` knows.
-        text: turns words into the features' space.
+        scene: the scene with one feature set, to whose origin the cameras are relative.
+        names: for each camera the name of the scene's view, or None.
         config: its mode and threshold are used.
         absent: words that are not in the scene, with the probability that they are; they are visible from nowhere.
         memory: of the Gaussians, where the features come from one.
-        pictures: draw a picture for each word.
     """
     # Rendering needs torch, which finding boxes does without.
     from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, pose_picture, view_picture
 
     field = FeatureField(scene, memory=memory, config=FromPoseConfig(mode=config.mode, threshold=config.threshold))
-    for view, name in enumerate(cameras.views):
-        frame = field.at(cameras.cameras, view)
-        points = [
-            replace(point, visible=point.visible and point.query not in absent) for point in frame.find(words, text)
-        ]
-        named_pictures = []
-        if pictures:
-            rgb = view_picture(frame)
-            for number, point in enumerate(points):
+    for view, name in enumerate(names):
+        frame = field.at(cameras, view)
+        points, named_pictures = [], []
+        rgb = view_picture(frame) if pictures else None
+        for number, point in enumerate(frame.find(words, text)):
+            point = replace(point, visible=point.visible and point.query not in absent)
+            values = {
+                "query": point.query,
+                "camera": view,
+                "view": name,
+                "visible": point.visible,
+                "absent": point.query in absent,
+                "relevancy": point.relevancy,
+                "threshold": point.threshold,
+                "alpha": point.alpha,
+                "pixel": point.pixel.tolist(),
+                "depth": point.depth,
+                "position": point.position.tolist(),
+            }
+            points.append({key: value if _is_finite(value) else None for key, value in values.items()})
+            if rgb is not None:
                 (relevancy,) = frame.relevancy([point.query], text)
                 safe = "".join(c if c.isalnum() else "_" for c in point.query)[:60]
                 picture = pose_picture(rgb, frame, point, relevancy)
                 named_pictures.append((f"pose{view:03d}_{number:02d}_{safe}", Image.fromarray(picture)))
-        yield (
-            [
-                {
-                    "query": point.query,
-                    "camera": view,
-                    "view": name,
-                    "visible": point.visible,
-                    "absent": point.query in absent,
-                    "relevancy": _finite(point.relevancy),
-                    "threshold": _finite(point.threshold),
-                    "alpha": _finite(point.alpha),
-                    "pixel": _finite_all(point.pixel.tolist()),
-                    "depth": _finite(point.depth),
-                    "position": _finite_all(point.position.tolist()),
-                }
-                for point in points
-            ],
-            named_pictures,
-        )
+        yield points, named_pictures
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _finite_all(values: list[float]) -> list[float] | None:
-    return values if all(map(math.isfinite, values)) else None
+def _is_finite(value: Any) -> bool:
+    numbers = value if isinstance(value, list) else [value]
+    return all(not isinstance(number, float) or math.isfinite(number) for number in numbers)
 
 
 def describe_point(point: dict[str, Any]) -> str:
@@ -251,3 +218,54 @@ def describe_point(point: dict[str, Any]) -> str:
     x, y = point["pixel"]
     coordinates = ", ".join(f"{value:.3f}" for value in point["position"])
     return f"{camera}: pixel ({x:.1f}, {y:.1f}), relevancy {point['relevancy']:.2f}, at ({coordinates})"
+
+
+PAIR_CELL = 560
+"""Smallest width of a view with its relevancy on the page, CSS pixels."""
+
+
+def report_words(folder: Path, scene: Scene, localization: Localization, run: Run) -> None:
+    """Writes the page of words in a scene."""
+    report = HtmlReport(f"Words in {scene.name}", "Clusters of Gaussians whose features answer a word.")
+    boxed = {box.query for box in localization.boxes}
+    counts = {"words": len(localization.queries), "with a box": len(boxed), "boxes": len(localization.boxes)}
+    report.facts({**counts, **run.costs()})
+    report.section("Words")
+    add_words(report, scene, localization)
+    report.section("Seconds of each step")
+    report.timings(run.timings)
+    report.write(folder / "report.html")
+
+
+def add_words(
+    report: HtmlReport, scene: Scene, localization: Localization, ious: Mapping[str, float] | None = None
+) -> None:
+    """Adds a picture of each word, with its relevancy and boxes, where the scene has views, and a table of the words;
+    `ious` are those of the first box of each word with the true one, where that is known."""
+    words = localization.queries
+    boxes = {word: [box for box in localization.boxes if box.query == word] for word in words}
+    if scene.views is not None:
+        from gsencoder.infer.pictures import relevancy_pictures  # with torch
+
+        # Names begin with the number of the word.
+        pictures = dict(relevancy_pictures(scene, localization, per_word=1))
+        captions = [_caption(word, len(boxes[word]), None if ious is None else ious[word]) for word in words]
+        report.pictures([np.asarray(pictures[name]) for name in sorted(pictures)], captions, cell=PAIR_CELL)
+        marks = set(localization.thresholds.tolist())
+        mark = marks.pop() if len(marks) == 1 else None
+        report.pictures([color_bar(640, 0.0, 1.0, mark=mark)], ["relevancy, with the threshold"], lossless=True)
+    rows = []
+    for word, probability in zip(words, localization.probabilities.tolist(), strict=True):
+        best = boxes[word][0] if boxes[word] else None
+        center = "–" if best is None else ", ".join(f"{value:.2f}" for value in best.center)
+        row: Sequence[object] = (word, len(boxes[word]), center, best.score if best is not None else 0.0, probability)
+        rows.append(row if ious is None else (*row, ious[word]))
+    columns = ("word", "boxes", "center of the first", "score", "probability")
+    report.table(columns if ious is None else (*columns, "IoU with the truth"), rows)
+
+
+def _caption(word: str, boxes: int, iou: float | None) -> str:
+    if not boxes:
+        return f"{word}: no box"
+    found = f"{boxes} box{'es' if boxes > 1 else ''}"
+    return f"{word}: {found}" if iou is None else f"{word}: IoU {iou:.2f} with the true box"

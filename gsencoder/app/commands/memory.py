@@ -26,7 +26,7 @@ from gsencoder.memory.bank import BankConfig
 from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.teachers.build import build_teacher, stored_words, words_by_teacher
 from gsencoder.text.table import TextTable
-from gsencoder.train.distributed import fail_together
+from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.loop import TrainerConfig
 from gsencoder.train.memory import (
     MemoryConfig,
@@ -91,7 +91,7 @@ def run(config: MemoryCommandConfig, run: Run) -> None:
     (path,) = find_scenes(config.paths)
     out = run.out(path.name, "memory")
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
-    with run.processes(config.device, out, state="training") as group:
+    with run.processes(join_processes, config.device, out, state="training") as group:
         process, device, work = group.process, group.device, group.work.path
         tables: dict[str, TextTable] = {}
         folder, scene = None, None

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from gsencoder.app.options import FolderConfig
 from gsencoder.app.run import Run
-from gsencoder.app.summary import report_budget, report_choice
 from gsencoder.core.archive import copy_checked
 from gsencoder.core.budget import MEGABYTE, reject_options_set_by_budget
 from gsencoder.core.errors import InputError, counted
@@ -183,8 +182,8 @@ def _report(
         return
     over_budget = budget.error is not None and budget.megabytes is not None and megabytes > budget.megabytes
     notes = [budget.conflict("megabytes", megabytes)] if over_budget else []
-    report_choice(run, scene.name, chosen, predicted={}, notes=notes, quiet=config.quiet)
-    lines = report_budget(run, budget, {"error": error, "megabytes": megabytes})
+    run.report_choice(scene.name, chosen, predicted={}, notes=notes)
+    lines = run.report_budget(budget, {"error": error, "megabytes": megabytes})
     run.print(*(f"{scene.name}: {line}" for line in lines))
 
 

@@ -10,9 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.app.options import SharedScenesConfig, settings
-from gsencoder.app.output import Summary
 from gsencoder.app.run import Run
-from gsencoder.app.summary import report_budget, report_choice
 from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import SceneWarning, counted
@@ -29,7 +27,7 @@ from gsencoder.infer.draw import contact_sheet
 from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
 from gsencoder.reconstruct.plan import choose_scale, refuse_late
 from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
-from gsencoder.reconstruct.score import Comparison, LogRow, Score, describe
+from gsencoder.reconstruct.score import LogRow, Score, describe
 from gsencoder.reconstruct.sfm import FRAMES_FOLDER, OpenedScene, SfmConfig, find_photographed, open_scene
 
 PLY_FILE, PICTURES_FILE, MODEL_FOLDER = "splat.ply", "held_out.png", "sparse/0"
@@ -108,7 +106,10 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, ru
             shutil.copytree(opened.photographs, folder / FRAMES_FOLDER, ignore=shutil.ignore_patterns(RECORD_FILE))
             run.results["images"] = FRAMES_FOLDER
         shutil.copy(work / LOG_FILE, folder / LOG_FILE)
-        draw(folder / PICTURES_FILE, result.comparisons)
+        if result.comparisons:
+            pictures = [picture for each in result.comparisons for picture in (each.photograph, each.render)]
+            titles = [f"{each.name}: {kind}" for each in result.comparisons for kind in ("photograph", "splat")]
+            write_picture(folder / PICTURES_FILE, contact_sheet(pictures, titles, columns=2))
         last: LogRow = result.log[-1] if result.log else {}
         run.results.update(result.seeding)
         run.results.update(
@@ -125,7 +126,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, ru
         seconds = result.elapsed + time.perf_counter() - ended
         # A scene without poses of its own has the name of the folder of its state.
         name = opened.scene.name if opened.sfm is None else path.name
-        lines = _report_budget(run, name, scale, result, folder / PLY_FILE, seconds, config)
+        lines = _report_budget(name, scale, result, folder / PLY_FILE, seconds, config, run)
     run.print(*(f"{out}: {line}" for line in lines))
     scores = f"; {describe(last)} on {counted(len(result.held_out), 'held-out photograph')}" if last else ""
     run.print(f"{out / PLY_FILE}: {counted(len(result.gaussians), 'Gaussian')}{scores}")
@@ -154,13 +155,13 @@ def _open(
 
 
 def _report_budget(
-    summary: Summary,
     scene: str,
     scale: float,
     result: Reconstruction,
     file: Path,
     seconds: float,
     config: ReconstructCommandConfig,
+    run: Run,
 ) -> list[str]:
     """What limits chose and what became of them; nothing where there are none."""
     budget, plan = config.budget, result.plan
@@ -171,16 +172,10 @@ def _report_budget(
     options = [f"data.image_scale={image_scale!r}", f"optimize.steps={plan.steps}"]
     if plan.most is not None:
         chosen["most_gaussians"] = plan.most
-    report_choice(
-        summary,
-        scene,
-        chosen,
-        predicted={name: value for name in budget.limits if (value := getattr(plan, name)) is not None},
-        notes=plan.notes,
-        quiet=config.quiet,
-        options=[*options, f"optimize.sh_degree={plan.sh_degree}", "budget.minutes=0"],
-    )
-    return report_budget(summary, budget, {"seconds": seconds, "megabytes": file.stat().st_size / MEGABYTE})
+    options += [f"optimize.sh_degree={plan.sh_degree}", "budget.minutes=0"]
+    predicted = {name: value for name in budget.limits if (value := getattr(plan, name)) is not None}
+    run.report_choice(scene, chosen, predicted=predicted, notes=plan.notes, options=options)
+    return run.report_budget(budget, {"seconds": seconds, "megabytes": file.stat().st_size / MEGABYTE})
 
 
 def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructCommandConfig, *, spent: float) -> float:
@@ -218,12 +213,3 @@ def _at_scale(
         "(data.image_scale= states another size)"
     )
     return replace(smaller, sfm=opened.sfm, seconds=opened.seconds)
-
-
-def draw(path: Path, comparisons: tuple[Comparison, ...]) -> None:
-    """Writes held-out photographs and renders side by side, if there are any."""
-    if not comparisons:
-        return
-    pictures = [picture for each in comparisons for picture in (each.photograph, each.render)]
-    titles = [f"{each.name}: {kind}" for each in comparisons for kind in ("photograph", "splat")]
-    write_picture(path, contact_sheet(pictures, titles, columns=2))

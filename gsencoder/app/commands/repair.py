@@ -146,7 +146,7 @@ def _repair_scene(path: Path, config: RepairConfig, run: Run) -> None:
 
 
 def _load_back(content: dict[str, Any], out: Path) -> Scene:
-    """The scene of a transforms.json that is to stand at `out`; a hidden file next to it holds it meanwhile."""
+    """The scene of a transforms.json that is to stand at `out`, by a hidden file next to it."""
     partial = out.with_name(f".{out.stem}.partial-{secrets.token_hex(6)}.json")
     try:
         write_json(partial, content)

@@ -10,7 +10,6 @@ from rich.markdown import Markdown
 from rich.table import Table
 
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.output import Summary
 from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, write_bytes
@@ -18,6 +17,7 @@ from gsencoder.core.settings import option
 from gsencoder.evaluate.benchmarks import SCORES
 from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.tables import ScoreReport
+from gsencoder.infer.page.report import HtmlReport
 
 TABLE = "table.md"
 MOST_COLUMNS = 10
@@ -63,7 +63,7 @@ def run(config: ScoreConfig, run: Run) -> None:
     print_report(out, report, run)
 
 
-def write_report(folder: Path, report: ScoreReport, summary: Summary, *, page: bool) -> None:
+def write_report(folder: Path, report: ScoreReport, run: Run, *, page: bool) -> None:
     """Writes the table as Markdown and CSV, the other rows, and a page where it is asked for, and adds the results to
     the summary."""
     write_bytes(folder / TABLE, report.table.markdown().encode())
@@ -75,11 +75,34 @@ def write_report(folder: Path, report: ScoreReport, summary: Summary, *, page: b
             for row in rows
         ]
         write_bytes(folder / f"{name}.csv", csv_text(rounded).encode())
-    summary.results.update(report.results)
+    run.results.update(report.results)
     if page:
-        from gsencoder.app.reports import report_benchmark
+        write_page(folder, report, run)
 
-        report_benchmark(folder, report, summary)
+
+def write_page(folder: Path, scores: ScoreReport, run: Run) -> None:
+    """Writes the page of a benchmark: measured rows above those of papers, and the rows by scene and class."""
+
+    def cell(value: Any) -> Any:
+        return "–" if value is None or value != value else value
+
+    table = scores.table.without_classes()
+    page = HtmlReport(table.title, scores.line)
+    page.facts({name: value for name, value in scores.results.items() if type(value) in (int, float)})
+    page.facts(run.costs())
+    page.section("Percent", "Rows of papers are of other scenes.")
+    rows = [(row.method, row.source, *(cell(row.values.get(name)) for name in table.columns)) for row in table.rows]
+    page.table(("method", "source", *table.columns), rows)
+    for note in table.notes:
+        page.paragraph(note)
+    for title, named in scores.rows.items():
+        if named:
+            page.section(title.capitalize())
+            columns = list(dict.fromkeys(name for row in named for name in row))
+            page.table(columns, [[cell(row.get(name)) for name in columns] for row in named])
+    page.section("Seconds of each step")
+    page.timings(run.timings)
+    page.write(folder / "report.html")
 
 
 def print_report(out: Path, report: ScoreReport, run: Run) -> None:

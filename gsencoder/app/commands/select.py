@@ -4,8 +4,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from gsencoder.app.options import QueriesConfig
 from gsencoder.app.run import Progress, Run
 from gsencoder.app.scenes import queried_scene, query_words
@@ -95,7 +93,14 @@ def run(config: SelectCommandConfig, run: Run) -> None:
                 run.results["holes"] = _holes(scene, selection, config.select, run.track)
             write_json(target / HOLES, run.results["holes"])
     for number, word in enumerate(words):
-        run.print(f"{one_line(word)}: {_describe(selection, number, localization.absent, files)}")
+        count = len(selection.rows(number))
+        text = f"{count:,} Gaussians, from {run.results['seeds'][number]:,} to start with"
+        if not count:
+            absent = localization.absent
+            text = describe_absent(absent[word]) if word in absent else "no Gaussians"
+        elif number + 1 in files:
+            text += f", {files[number + 1]}"
+        run.print(f"{one_line(word)}: {text}")
     run.print(f"{out}: {_listing(selection, config, files, run.results.get('holes'))}")
 
 
@@ -128,16 +133,6 @@ def _holes(scene: Scene, selection: Selection, config: SelectConfig, track: Prog
         "largest_area": max((hole.area for hole in holes), default=0.0),
         "by_view": rows,
     }
-
-
-def _describe(selection: Selection, number: int, absent: dict[str, float], files: dict[int, str]) -> str:
-    count = len(selection.rows(number))
-    if not count:
-        word = selection.words[number]
-        return describe_absent(absent[word]) if word in absent else "no Gaussians"
-    seeds = int(np.count_nonzero(selection.seeds == number + 1))
-    in_file = f", {files[number + 1]}" if number + 1 in files else ""
-    return f"{count:,} Gaussians, from {seeds:,} to start with{in_file}"
 
 
 def _listing(

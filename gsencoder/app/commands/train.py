@@ -11,19 +11,19 @@ from typing import ClassVar, Literal
 from gsencoder.app.options import CommonConfig, settings
 from gsencoder.app.output import prepared_folder
 from gsencoder.app.run import Run
-from gsencoder.app.summary import basis_figures, describe_basis
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
+from gsencoder.fusion.basis import basis_figures, describe_basis
 from gsencoder.fusion.errors import total_fit
 from gsencoder.fusion.folder import HEADS_FILE, save_tables
 from gsencoder.fusion.measured_heads import HeadSet, save_heads
 from gsencoder.infer.encode import EncodeConfig
 from gsencoder.models.output_space import WEIGHTS_FILE, OutputSpace
 from gsencoder.models.weights import save_weights
-from gsencoder.train.distributed import fail_together
+from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, check_same_teachers
 from gsencoder.train.prepare_scenes import split_scenes
 from gsencoder.train.prepared_file import PreparedScene
@@ -68,7 +68,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
     prepared = prepared_folder(config.prepared, out)
     training, held_out = split_scenes(find_scenes(config.paths), config.holdout, config.split, config.holdout_split)
     words = config.load_words()
-    with run.processes(config.device, out, state="training") as group:
+    with run.processes(join_processes, config.device, out, state="training") as group:
         process, device, folder = group.process, group.device, None
         with fail_together():
             if not config.prepare_only:
@@ -117,8 +117,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
 
 
 def encoder_basis_figures(outputs: OutputSpace, held_out: Sequence[PreparedScene]) -> dict[str, int | float]:
-    """The figures of an encoder's basis, with those of the teacher's vectors in held-out scenes, which it was not
-    fitted to; scenes that were prepared without such figures are left out."""
+    """The figures of an encoder's basis, with those of the teacher's vectors in held-out scenes."""
     sums = [each for scene in held_out if (each := scene.projections()) is not None]
     of_others = total_fit(sums).figures() if sums and outputs.basis is not None else {}
     return {**basis_figures(outputs.basis, outputs.channels), **of_others}

@@ -30,203 +30,10 @@ from gsencoder.infer.ask.ask import Asker, Question
 from gsencoder.infer.ask.batch import store_prompt
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.localize import select_features
-from gsencoder.train.distributed import fail_together
+from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.tune import TuneConfig, TuningPair, open_processor, save_tuned, tune
 from gsencoder.train.vlm import SERVED_FOLDER, TowerLayout, check_peft, link_served
 from gsencoder.types import GaussianFeatures
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PromptRecipe:
-    """How questions become prompts: the options of `ask`, and the tower whose output rendered features replace.
-
-    Attributes:
-        config: the options of `ask`.
-        vlm: size of the pictures.
-        tokens: name of the features that are rendered on the tower's grid; empty = none.
-        layout: of the tower's output, with `tokens`.
-    """
-
-    config: AskingConfig
-    vlm: VlmConfig
-    tokens: str
-    layout: TowerLayout | None
-
-    def to_json(self) -> dict[str, Any]:
-        """All that prompts depend on besides scene and question."""
-        names = ("words", "space", "head", "ask", "choose", "localize", "data", "text")
-        values = {name: plain(getattr(self.config, name)) for name in names}
-        return values | {"tokens": self.tokens, "layout": plain(self.layout), "image_side": self.vlm.image_side}
-
-
-def read_dataset(path: Path, split: str, scenes: Sequence[str]) -> tuple[TruthQuestion, ...]:
-    """Questions with answers of ScanQA or SQA3D, by their scenes, of one file or of the one in a folder.
-
-    Args:
-        split: a part of the file's name in a folder with several.
-        scenes: names of scenes, with * and ?; empty = all.
-    """
-    questions = read_questions(_dataset_file(path, split))
-    if scenes:
-        for pattern in scenes:
-            if not any(fnmatchcase(each.scene, pattern) for each in questions):
-                raise InputError(f"scenes: {path} has no question about a scene called {pattern}")
-        questions = tuple(each for each in questions if any(fnmatchcase(each.scene, name) for name in scenes))
-    if not questions:
-        raise InputError(f"{path}: holds no questions")
-    for each in questions:
-        if not all(answer.strip() for answer in each.answers):
-            raise InputError(f"{path}: question {each.id}: an answer is empty; mend or remove it")
-    return tuple(sorted(questions, key=lambda each: each.scene))
-
-
-def _dataset_file(path: Path, split: str) -> Path:
-    if not path.is_dir():
-        return path
-    files = sorted(each for each in path.glob("*.json") if "annotations" not in each.name)
-    if len(files) > 1:
-        files = [each for each in files if split in each.stem.lower().split("_")]
-    if len(files) != 1:
-        names = sorted(each.name for each in path.glob("*.json"))
-        raise InputError(
-            f"{path}: expected one file of ScanQA's or SQA3D's questions with {split} in its name, got "
-            f"{listed([each.name for each in files]) or 'none'}"
-            + (f" among {listed(names)}" if names else "")
-            + "; give the file itself, or split="
-        )
-    return files[0]
-
-
-def scene_folders(questions: Sequence[TruthQuestion], folder: Path, option: str) -> dict[str, Path]:
-    """The folder of each scene that is asked about."""
-    if not folder.is_dir():
-        raise InputError(f"{option}: {folder} is no folder; expected one with a folder for each scene")
-    names = list(dict.fromkeys(each.scene for each in questions))
-    missing = [name for name in names if not (folder / name).is_dir()]
-    if missing:
-        raise InputError(
-            f"{option}: {folder} has no folder for {len(missing)} of {len(names)} scenes that are asked about: "
-            f"{listed(missing, 3)}; make them, or choose scenes with scenes="
-        )
-    return {name: folder / name for name in names}
-
-
-def prepare_prompts(
-    questions: Sequence[TruthQuestion],
-    features: Path,
-    photos: str,
-    recipe: PromptRecipe,
-    folder: Path,
-    *,
-    track: Track,
-) -> None:
-    """Writes the prompts that are not in the folder yet; it is locked meanwhile.
-
-    Args:
-        features: with a folder for each scene.
-        photos: the same for photographs; empty = renders are shown.
-        folder: created if it does not exist.
-
-    Warns:
-        SceneWarning: questions that name nothing, once with their number.
-    """
-    folders = scene_folders(questions, features, "features")
-    photo_folders = scene_folders(questions, Path(photos), "photos") if photos else {}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / PROMPTS_FILE).is_file() and any(
-            each.name not in ("pictures", "tokens") for each in folder.iterdir()
-        ):
-            raise InputError(f"prepared: {folder} holds something else; give another folder")
-        lock = lock_folder(folder)
-    except BlockingIOError:
-        raise BusyError(f"prepared: {folder}: another run prepares prompts here now; wait for it") from None
-    except OSError as error:
-        raise InputError(f"prepared: {folder} cannot be written: {error.strerror or error}") from error
-    try:
-        store = PromptStore(folder)
-        keys = prompt_keys(questions, features, photos, recipe)
-        current: tuple[str, Asker, GaussianFeatures | None] | None = None
-        messages: list[str] = []
-        for each, key in track(list(zip(questions, keys, strict=True)), "preparing prompts"):
-            if key in store.prompts:
-                continue
-            with about(f"question {each.id}"):
-                if current is None or current[0] != each.scene:
-                    current = (each.scene, *_asker(folders[each.scene], str(photo_folders.get(each.scene, "")), recipe))
-                messages += _store(store, key, current[1], each, current[2], recipe)
-        if messages:
-            warnings.warn(f"{len(messages)} of {len(questions)} questions: {messages[0]}", SceneWarning, stacklevel=2)
-    finally:
-        if lock is not None:
-            os.close(lock)
-
-
-def tuning_pairs(
-    questions: Sequence[TruthQuestion], features: Path, photos: str, recipe: PromptRecipe, store: PromptStore
-) -> list[TuningPair]:
-    """Questions with their prompts and answers; arguments are those of `prepare_prompts`."""
-    pairs = []
-    for each, key in zip(questions, prompt_keys(questions, features, photos, recipe), strict=True):
-        if key not in store.prompts:
-            raise InputError(f"{store.folder}: has no prompt of question {each.id}; another run has changed the folder")
-        name = f"question {each.id} ({each.scene})"
-        pairs.append(TuningPair(name=name, prompt=store.prompts[key], answers=each.answers))
-    return pairs
-
-
-def prompt_keys(questions: Sequence[TruthQuestion], features: Path, photos: str, recipe: PromptRecipe) -> list[str]:
-    """A key for each question, of all that its prompt is made from; changed files of a scene are noticed by their sizes
-    and times."""
-    of_recipe = json.dumps(recipe.to_json(), sort_keys=True)
-    scenes = {}
-    for name in {each.scene for each in questions}:
-        folders = [features / name, *([Path(photos) / name] if photos else [])]
-        scenes[name] = [_state(folder) for folder in folders]
-    made_from = ([each.situated_text, scenes[each.scene], of_recipe] for each in questions)
-    return [sha256(json.dumps(values).encode()).hexdigest()[:32] for values in made_from]
-
-
-def _state(folder: Path) -> list[list[Any]]:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return [[str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns] for path in files]
-
-
-def _asker(folder: Path, photos: str, recipe: PromptRecipe) -> tuple[Asker, GaussianFeatures | None]:
-    """What asks about a scene, and the features that are rendered as tokens."""
-    scene = shown_scene(folder, photos, recipe.config.data)
-    features = None
-    if recipe.tokens:
-        with about(f"tokens={recipe.tokens}"):
-            features = select_features(scene, recipe.tokens)[1]
-    return asker_of(recipe.config, recipe.vlm, scene, folder), features
-
-
-def _store(
-    store: PromptStore,
-    key: str,
-    asker: Asker,
-    question: TruthQuestion,
-    features: GaussianFeatures | None,
-    recipe: PromptRecipe,
-) -> list[str]:
-    """Writes one prompt; what was warned of."""
-    layout = recipe.layout
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        store_prompt(
-            store,
-            key,
-            asker,
-            Question(text=question.situated_text),
-            features=features,
-            grid=(1, 1) if layout is None else layout.grid,
-            fit="stretch" if layout is None else layout.fit,
-        )
-    for each in caught:
-        if not issubclass(each.category, SceneWarning):
-            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-    return [str(each.message) for each in caught if issubclass(each.category, SceneWarning)][:1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -277,25 +84,27 @@ def run(config: TuneCommandConfig, run: Run) -> None:
     out = run.out("tune")
     prepared = prepared_folder(config.prepared, out)
     questions = read_dataset(Path(config.paths[0]), config.split, config.scenes)
-    model, features = find_file(config.model, "model", folder=True), Path(config.features)
+    model = find_file(config.model, "model", folder=True)
     _, _, layout = open_processor(model, with_tokens=bool(config.tokens))
-    recipe = PromptRecipe(
-        config=config, vlm=VlmConfig(image_side=config.image_side), tokens=config.tokens, layout=layout
-    )
-    with run.processes(config.device, out, state="training") as group:
+    with run.processes(join_processes, config.device, out, state="training") as group:
         folder, work = None, group.work.path
         with fail_together(), run.step("prepare"):
             if not config.prepare_only:
                 folder = group.folder()
             if group.process.is_first:
-                prepare_prompts(questions, features, config.photos, recipe, prepared, track=run.track)
+                prepare_prompts(questions, config, layout, prepared, track=run.track)
         if config.prepare_only:
             run.print(f"{prepared}: prompts of {counted(len(questions), 'question')}")
             return
         with fail_together():
             group.take(resume=config.resume)
         store = PromptStore(prepared)
-        pairs = tuning_pairs(questions, features, config.photos, recipe, store)
+        pairs = []
+        for each, key in zip(questions, prompt_keys(questions, config, layout), strict=True):
+            if key not in store.prompts:
+                raise InputError(f"{prepared}: has no prompt of question {each.id}; another run has changed the folder")
+            name = f"question {each.id} ({each.scene})"
+            pairs.append(TuningPair(name=name, prompt=store.prompts[key], answers=each.answers))
         with run.step("train"):
             result = tune(
                 pairs,
@@ -332,17 +141,150 @@ def run(config: TuneCommandConfig, run: Run) -> None:
             adapters="adapter_model.safetensors",
             log=LOG_FILE,
         )
-    trained = run.results["trained"]
+    course = f"went from {losses[0]:.3f} to {losses[-1]:.3f}"
+    if len(losses) == 1:
+        course = f"was {losses[0]:.3f} in the log's only row (train.log_every={config.train.log_every})"
     run.print(
         f"{out}: {counted(result.state.step, 'step')} on {counted(len(questions), 'question')}, "
-        f"{counted(trained, 'parameter')} of adapters; {_told_losses(losses, config.train.log_every)}"
+        f"{counted(run.results['trained'], 'parameter')} of adapters; the loss of an answer's token {course}"
     )
     if not config.tokens:
         run.print(f"{out}: transformers serve {out / SERVED_FOLDER}")
 
 
-def _told_losses(losses: Sequence[float], log_every: int) -> str:
-    """How the loss of an answer's token went, by the rows of the log."""
-    if len(losses) == 1:
-        return f"the loss of an answer's token was {losses[0]:.3f} in the log's only row (train.log_every={log_every})"
-    return f"the loss of an answer's token went from {losses[0]:.3f} to {losses[-1]:.3f}"
+def read_dataset(path: Path, split: str, scenes: Sequence[str]) -> tuple[TruthQuestion, ...]:
+    """Questions with answers of ScanQA or SQA3D, by their scenes, of a file or of that in a folder with `split` in its
+    name; `scenes` are names with * and ?, none = all."""
+    questions = read_questions(_dataset_file(path, split))
+    for pattern in scenes:
+        if not any(fnmatchcase(each.scene, pattern) for each in questions):
+            raise InputError(f"scenes: {path} has no question about a scene called {pattern}")
+    questions = tuple(each for each in questions if any(fnmatchcase(each.scene, name) for name in scenes or ["*"]))
+    if not questions:
+        raise InputError(f"{path}: holds no questions")
+    for each in questions:
+        if not all(answer.strip() for answer in each.answers):
+            raise InputError(f"{path}: question {each.id}: an answer is empty; mend or remove it")
+    return tuple(sorted(questions, key=lambda each: each.scene))
+
+
+def _dataset_file(path: Path, split: str) -> Path:
+    if not path.is_dir():
+        return path
+    files = sorted(each for each in path.glob("*.json") if "annotations" not in each.name)
+    if len(files) > 1:
+        files = [each for each in files if split in each.stem.lower().split("_")]
+    if len(files) != 1:
+        names = sorted(each.name for each in path.glob("*.json"))
+        raise InputError(
+            f"{path}: expected one file of ScanQA's or SQA3D's questions with {split} in its name, got "
+            f"{listed([each.name for each in files]) or 'none'}"
+            + (f" among {listed(names)}" if names else "")
+            + "; give the file itself, or split="
+        )
+    return files[0]
+
+
+def scene_folders(questions: Sequence[TruthQuestion], folder: Path, option: str) -> dict[str, Path]:
+    """The folder of each scene that is asked about."""
+    if not folder.is_dir():
+        raise InputError(f"{option}: {folder} is no folder; expected one with a folder for each scene")
+    names = list(dict.fromkeys(each.scene for each in questions))
+    missing = [name for name in names if not (folder / name).is_dir()]
+    if missing:
+        raise InputError(
+            f"{option}: {folder} has no folder for {len(missing)} of {len(names)} scenes that are asked about: "
+            f"{listed(missing, 3)}; make them, or choose scenes with scenes="
+        )
+    return {name: folder / name for name in names}
+
+
+def prepare_prompts(
+    questions: Sequence[TruthQuestion],
+    config: TuneCommandConfig,
+    layout: TowerLayout | None,
+    folder: Path,
+    *,
+    track: Track,
+) -> None:
+    """Writes the prompts that are not in the folder yet; it is created, and locked meanwhile.
+
+    Warns:
+        SceneWarning: questions that name nothing, once with their number.
+    """
+    folders = scene_folders(questions, Path(config.features), "features")
+    photos = scene_folders(questions, Path(config.photos), "photos") if config.photos else {}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        names = {each.name for each in folder.iterdir()}
+        if PROMPTS_FILE not in names and names - {"pictures", "tokens"}:
+            raise InputError(f"prepared: {folder} holds something else; give another folder")
+        lock = lock_folder(folder)
+    except BlockingIOError:
+        raise BusyError(f"prepared: {folder}: another run prepares prompts here now; wait for it") from None
+    except OSError as error:
+        raise InputError(f"prepared: {folder} cannot be written: {error.strerror or error}") from error
+    try:
+        store = PromptStore(folder)
+        scene, asker, features = "", None, None
+        messages: list[str] = []
+        keys = prompt_keys(questions, config, layout)
+        for each, key in track(list(zip(questions, keys, strict=True)), "preparing prompts"):
+            if key in store.prompts:
+                continue
+            with about(f"question {each.id}"):
+                if asker is None or scene != each.scene:
+                    scene = each.scene
+                    asker, features = _asker(folders[scene], str(photos.get(scene, "")), config)
+                messages += _store(store, key, asker, each, features, layout)
+        if messages:
+            warnings.warn(f"{len(messages)} of {len(questions)} questions: {messages[0]}", SceneWarning, stacklevel=2)
+    finally:
+        if lock is not None:
+            os.close(lock)
+
+
+def prompt_keys(questions: Sequence[TruthQuestion], config: TuneCommandConfig, layout: TowerLayout | None) -> list[str]:
+    """A key for each question, of all that its prompt is made from; changed files of a scene are noticed by their sizes
+    and times."""
+    names = ("words", "space", "head", "ask", "choose", "localize", "data", "text", "tokens", "image_side")
+    values = {name: plain(getattr(config, name)) for name in names} | {"layout": plain(layout)}
+    recipe = json.dumps(values, sort_keys=True)
+    roots = [Path(root) for root in (config.features, config.photos) if root]
+    states = {scene: [_state(root / scene) for root in roots] for scene in {each.scene for each in questions}}
+    made_from = ([each.situated_text, states[each.scene], recipe] for each in questions)
+    return [sha256(json.dumps(values).encode()).hexdigest()[:32] for values in made_from]
+
+
+def _state(folder: Path) -> list[list[Any]]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return [[str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns] for path in files]
+
+
+def _asker(folder: Path, photos: str, config: TuneCommandConfig) -> tuple[Asker, GaussianFeatures | None]:
+    """What asks about a scene, and the features that are rendered as tokens."""
+    scene = shown_scene(folder, photos, config.data)
+    features = None
+    if config.tokens:
+        with about(f"tokens={config.tokens}"):
+            features = select_features(scene, config.tokens)[1]
+    return asker_of(config, VlmConfig(image_side=config.image_side), scene, folder), features
+
+
+def _store(
+    store: PromptStore,
+    key: str,
+    asker: Asker,
+    question: TruthQuestion,
+    features: GaussianFeatures | None,
+    layout: TowerLayout | None,
+) -> list[str]:
+    """Writes one prompt; what was warned of."""
+    of_tower: dict[str, Any] = {} if layout is None else {"grid": layout.grid, "fit": layout.fit}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        store_prompt(store, key, asker, Question(text=question.situated_text), features=features, **of_tower)
+    for each in caught:
+        if not issubclass(each.category, SceneWarning):
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return [str(each.message) for each in caught if issubclass(each.category, SceneWarning)][:1]

@@ -25,6 +25,8 @@ from gsencoder.types import Scene, SceneObject
 from gsencoder.types.orientation import upright_scene
 
 SUFFIX = ".html"
+FEATURE_ERROR = 0.01
+"""Largest mean loss of centered cosine of the quantized features in a file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +49,6 @@ class ViewConfig(FeaturesConfig):
         1_000_000, "of more Gaussians this number is drawn and searched, evenly chosen and enlarged", ge=1
     )
     port: int = option(0, "of the server; 0 = any that is free", ge=0, lt=1 << 16)
-    host: str = option("127.0.0.1", "address that the server listens on; others than 127.0.0.1 open it to a network")
     open: bool | None = option(None, "open a browser; empty = if standard output is a terminal")
     megabytes: float = option(
         25.0,
@@ -55,7 +56,6 @@ class ViewConfig(FeaturesConfig):
         gt=0,
         lt=2000,
     )
-    error: float = option(0.01, "largest mean loss of centered cosine of the quantized features in out=", gt=0, lt=1)
     photographs: int = option(24, "largest number of photographs in out=", ge=0)
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
@@ -65,11 +65,6 @@ class ViewConfig(FeaturesConfig):
         FeaturesConfig.__post_init__(self)
         if len(self.paths) > 2:
             raise InputError(f"paths: expected one or two folders of features, got {len(self.paths)}")
-        if self.host in ("", "0.0.0.0", "::"):
-            raise InputError(
-                f"host: expected one address, such as 127.0.0.1 or that of a network, got {self.host!r}; requests for "
-                "other addresses are refused"
-            )
         if self.localize.contrast or self.localize.mode != "centered":
             raise InputError("localize.contrast, localize.mode: the page compares centered cosines; leave them out")
         if self.out is not None and self.out.suffix.lower() != SUFFIX:
@@ -92,7 +87,9 @@ def run(config: ViewConfig, run: Run) -> None:
             "of one scene, which are shown under one camera"
         )
     objects = () if photographed is None else photographed.objects
-    titles = _titles([Path(path) for path in config.paths])
+    titles = [Path(path).resolve().name for path in config.paths]
+    if len(set(titles)) < len(titles):
+        titles = list(config.paths)
     if config.out is not None:
         _write(config.out, config, bundle, loaded, titles, objects, run)
     else:
@@ -108,12 +105,6 @@ def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple
             # Features such as DINOv2's can be looked at.
             return replace(scene, features={features.space.name: features}), None
     return queried_scene(scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text)
-
-
-def _titles(folders: Sequence[Path]) -> list[str]:
-    """What tells two folders apart: their names, or their paths where the names are the same."""
-    names = [folder.resolve().name for folder in folders]
-    return names if len(set(names)) == len(names) else [str(folder) for folder in folders]
 
 
 def _serve(
@@ -134,7 +125,7 @@ def _serve(
     settings = {"kind": "server", "scenes": len(searches), "notes": []}
     page = served_page(bundle, f"{name} · gsencoder view", settings)
     scenes = [scene_container(search, objects) for search in searches]
-    with ViewServer(page, searches, scenes, host=config.host, port=config.port) as server:
+    with ViewServer(page, searches, scenes, port=config.port) as server:
         # The address is the result: it is printed also where there is no terminal, at once.
         print(f"{server.address} shows {printable(name)}; Ctrl-C ends it", flush=True)
         if config.open or (config.open is None and sys.stdout.isatty()):
@@ -154,7 +145,7 @@ def _write(
     objects: tuple[SceneObject, ...],
     run: Run,
 ) -> None:
-    options = FileOptions(error=config.error, sh_degree=3, photographs=config.photographs, photograph_side=640)
+    options = FileOptions(error=FEATURE_ERROR, sh_degree=3, photographs=config.photographs, photograph_side=640)
     with run.step("page"):
         page = fitting_page(
             bundle,

@@ -7,7 +7,6 @@ from gsencoder.app.heads import features_for_heads, heads_of_folder
 from gsencoder.app.options import QueriesConfig
 from gsencoder.app.run import Run
 from gsencoder.app.scenes import queried_scene, query_words, shown_scene
-from gsencoder.app.summary import report_budget, report_choice
 from gsencoder.core.archive import write_archive
 from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.errors import InputError
@@ -107,9 +106,7 @@ def run(config: ViewsCommandConfig, run: Run) -> None:
         else:
             views = choose_views(scene, targets, config.choose)
     if choice is not None:
-        report_choice(
-            run, scene.name, choice.chosen, predicted=choice.predicted, notes=choice.notes, quiet=config.quiet
-        )
+        run.report_choice(scene.name, choice.chosen, predicted=choice.predicted, notes=choice.notes)
     out = run.out(scene.name, "views")
     rows = views_to_json(scene, views)
     run.results.update(views=rows, judged=views.judged)

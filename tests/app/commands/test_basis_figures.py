@@ -6,19 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_runs import results_of
-from text_towers import WORDS, save_graph, save_tokenizer
 
 from gsencoder.app import main as cli
-from gsencoder.app.summary import describe_basis
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
+from gsencoder.fusion.basis import describe_basis
 from gsencoder.fusion.errors import project_maps
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.models.weights import load_weights
 from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
-from gsencoder.text.table import REFERENCE_NOUNS
 
 pytestmark = pytest.mark.slow
 
@@ -119,19 +117,3 @@ def test_a_phrase_states_what_is_known() -> None:
     figures |= {"other_energy": 0.915, "other_cosine": 0.93, "other_worst": 0.82}
     expected = "rank 128, keeps 0.9912 of the energy, and 0.9150 in this scene (cosine 0.930, worst 5 % below 0.820)"
     assert describe_basis(figures, "this scene") == expected
-
-
-def test_the_teacher_of_weights_that_were_trained_with_a_text_tower_has_its_words(folder: Path, tmp_path: Path) -> None:
-    names = {each.name for number in range(2) for each in load_scene(folder / f"room_{number}").objects if each.name}
-    tokens = WORDS[:4] + tuple(sorted({token for name in (*names, *REFERENCE_NOUNS) for token in name.split()}))
-    (tmp_path / "tower").mkdir()
-    save_tokenizer(tmp_path / "tower/tokenizer.json", tokens)
-    save_graph(tmp_path / "tower/model.onnx", len(tokens))
-    words = [str(folder / f"room_{number}") for number in range(2)]
-    settings = [each for each in TRAIN if not each.startswith("teacher=")]
-    text = ["text=onnx", f"text.model={tmp_path / 'tower'}", "text.pooling=mean"]
-    named = ["teacher=labels", *text, f"out={tmp_path / 'encoder'}", "quiet=true"]
-    assert cli.main(["train", *words, *settings, *named]) == 0
-    encode = ["encode", str(folder / "room_0"), f"weights={tmp_path / 'encoder'}", "quiet=true", "basis_views=2"]
-    assert cli.main([*encode, f"out={tmp_path / 'measured'}"]) == 0
-    assert 0 < results_of(tmp_path / "measured")["basis"]["other_energy"] <= 1

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from command_runs import refusal
 from splats import random_gaussians
-from textured_box import box_cameras, box_views, write_box
 from viewed_rooms import STUB
 
 from gsencoder.app import main as cli
@@ -17,10 +16,8 @@ from gsencoder.data.splats.files import save_splat
 
 COMMANDS = {
     "view": (["view", "features"], "page.html"),
-    "repair of a splat": (["repair", "splat.ply"], "new.ply"),
-    "repair of a scene": (["repair", "scene"], "new.json"),
+    "repair": (["repair", "splat.ply"], "new.ply"),
     "export": (["export", "weights=encoder"], "encoder.onnx"),
-    "export of a memory": (["export", "memory=memory"], "memory.onnx"),
 }
 
 
@@ -28,7 +25,6 @@ COMMANDS = {
 def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Inputs, of which that they are read is a fault."""
     save_splat(tmp_path / "splat.ply", random_gaussians(20))
-    write_box(tmp_path / "scene", box_views(box_cameras(2, width=32, height=24, focal=22.0)))
     (tmp_path / "results").mkdir()
     monkeypatch.chdir(tmp_path)
 
@@ -68,10 +64,6 @@ def test_a_folder_that_is_missing_and_a_name_that_is_too_long(name: str, capsys:
     words, file = COMMANDS[name]
     assert "the folder nowhere does not exist; make it first" in refusal(capsys, *words, f"out=nowhere/{file}")
     assert "File name too long" in refusal(capsys, *words, f"out=results/{'x' * 250}{file}")
-
-
-def test_a_suffix_of_no_splat(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "new.obj: cannot write .obj; expected" in refusal(capsys, "repair", "splat.ply", "out=new.obj")
 
 
 @pytest.mark.parametrize("name", COMMANDS)

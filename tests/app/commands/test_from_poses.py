@@ -8,7 +8,7 @@ import pytest
 from memory_samples import make_memory
 from splats import front_camera, random_gaussians
 
-from gsencoder.app.commands.localize import RequestedCameras, memory_of, search_from_poses
+from gsencoder.app.commands.localize import memory_of, search_from_poses
 from gsencoder.fusion.folder import load_features, save_features, save_memories
 from gsencoder.infer.from_pose import FromPoseConfig, from_pose
 from gsencoder.infer.localize import LocalizeConfig
@@ -43,8 +43,7 @@ def asked_scene(count: int = 200) -> Scene:
 )
 def test_points_are_those_of_the_mode_and_the_threshold_that_are_asked_for(config: LocalizeConfig) -> None:
     scene, cameras = asked_scene(), front_camera()
-    requested = RequestedCameras(cameras=cameras, views=(None,))
-    ((points, drawn),) = search_from_poses(scene, requested, WORDS, TEXT, config, pictures=False)
+    ((points, drawn),) = search_from_poses(scene, cameras, [None], WORDS, TEXT, config, pictures=False)
     expected = from_pose(scene, cameras, WORDS, TEXT, FromPoseConfig(mode=config.mode, threshold=config.threshold))
     assert [(each["relevancy"], each["threshold"], each["visible"]) for each in points] == [
         (each.relevancy, each.threshold, each.visible) for each in expected

@@ -13,8 +13,6 @@ from PIL import Image
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import main as cli
-from gsencoder.core.errors import InputError
-from gsencoder.data.check.findings import Finding, repair_posed
 from gsencoder.data.readers.transforms_json import read_transforms, transforms_of
 from gsencoder.data.readers.undistort import CameraModel
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
@@ -58,14 +56,6 @@ def opencv_axes(content: dict[str, Any]) -> None:
     set_matrices(content, matrices(content) @ OPENCV_FROM_OPENGL)
 
 
-def next_poses(content: dict[str, Any]) -> None:
-    set_matrices(content, np.roll(matrices(content), -1, axis=0))
-
-
-def wrong_scale(content: dict[str, Any]) -> None:
-    content["depth_unit_scale_factor"] *= 5
-
-
 def wrong_focal(content: dict[str, Any]) -> None:
     content["fl_x"] *= 1.1
     content["fl_y"] *= 1.1
@@ -78,8 +68,6 @@ def two_exchanged(content: dict[str, Any]) -> None:
 
 FAULTS: dict[str, tuple[Change, str, str]] = {
     "axes": (opencv_axes, "OpenGL's camera axes", f"{VIEWS} of {VIEWS} views"),
-    "order": (next_poses, r"photograph \+1 places away", f"{VIEWS} of {VIEWS} views"),
-    "depth scale": (wrong_scale, r"depths should be 0\.2 times", f"{VIEWS} of {VIEWS} views"),
     "focal length": (wrong_focal, r"focal length of the photographs is 0\.9", f"{VIEWS} of {VIEWS} views"),
     "two exchanged": (two_exchanged, "view images/00[16].png: its pose does not fit", "6 of 8 views"),
 }
@@ -162,13 +150,6 @@ def test_repair_of_a_scene_without_faults_writes_nothing(
     assert not list(tmp_path.iterdir())
     assert cli.main(["repair", str(box), f"out={tmp_path / 'repaired.ply'}"]) == 2
     assert "give a name in .json" in capsys.readouterr().err
-
-
-def test_what_no_reading_explains_is_not_repaired(box: Path) -> None:
-    posed = read_posed(box)[0]
-    assert posed is not None
-    with pytest.raises(InputError, match="poses are noise; this cannot be repaired here"):
-        repair_posed(posed, [Finding(cause="unknown", message="poses are noise")])
 
 
 def test_photographs_and_depth_of_two_cameras_are_registered_by_repair(

@@ -1,6 +1,5 @@
 """`reconstruct`, as a user runs it: RGB-D, points, a splat to refine, photographs alone, and what goes wrong."""
 
-import json
 import os
 import shutil
 from pathlib import Path
@@ -115,16 +114,7 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(
     placed = (work / "placed.json").read_bytes()
     monkeypatch.setattr("gsencoder.reconstruct.sfm.load_pycolmap", never)
     # Places of another placement would put old Gaussians into a new world.
-    for damaged in (
-        b"",
-        b"[]",
-        b"{}",
-        b'{"asked": 1}',
-        placed[:-9],
-        placed.replace(b"found", b"lost"),
-        placed.replace(b"grey", b"gray"),
-        b"\xff\xfe",
-    ):
+    for damaged in (b"", b'{"asked": 1}', placed.replace(b"grey", b"gray"), b"\xff\xfe"):
         (work / "placed.json").write_bytes(damaged)
         assert "where its photographs were placed (placed.json, sparse/0) is gone or damaged" in refusal(capsys, *words)
     (work / "placed.json").write_bytes(placed)
@@ -205,31 +195,11 @@ def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(
     assert cli.main(["reconstruct", *words, "resume=false"]) == 0
 
 
-def test_a_held_out_photograph_that_is_masked_all_over_is_named_and_not_judged_by(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from PIL import Image
-
-    scene, out = shutil.copytree(room, tmp_path / "scene"), tmp_path / "out"
-    record = json.loads((scene / "transforms.json").read_text())
-    (scene / "masks").mkdir()
-    for number, frame in enumerate(record["frames"]):
-        Image.new("L", (120, 90), 255 if number else 0).save(scene / "masks" / f"{number}.png")
-        frame["mask_path"] = f"masks/{number}.png"
-    (scene / "transforms.json").write_text(json.dumps(record))
-    assert cli.main(["reconstruct", str(scene), f"out={out}", *QUICK]) == 0
-    assert "1 of 2 held-out photographs are masked all over and not used" in capsys.readouterr().err
-    results = summary_of(out)["results"]
-    assert results["held_out"] == 1
-    assert results["psnr"] > 5
-
-
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
         (["holdout=1"], "holdout: expected 0 (none) or 2 and more"),
         (["data.max_views=2", "holdout=2"], "expected at least 2 photographs to fit"),
-        (["optimize.steps=-1"], "optimize.steps: expected 0 or more"),
         (["seeds.source=points"], "has no structure-from-motion points"),
         pytest.param(
             ["device=cuda"], "sees no GPU", marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is one")
@@ -242,13 +212,6 @@ def test_what_cannot_be_is_told(
 ) -> None:
     assert problem in refusal(capsys, str(room), f"out={tmp_path / 'out'}", *words)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_bare_splat_cannot_be_fitted_to_anything(
-    built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    problem = refusal(capsys, str(built / "splat.ply"), f"out={tmp_path / 'out'}")
-    assert "a splat without photographs" in problem
 
 
 def test_every_eighth_photograph_is_kept() -> None:

@@ -11,7 +11,6 @@ import pytest
 from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
 from gsencoder.app import main as cli
-from gsencoder.core.errors import InputError
 from gsencoder.reconstruct import run as fit
 from gsencoder.reconstruct import run as reconstruct
 
@@ -83,33 +82,6 @@ def _floor(folder: Path) -> Path:
     path = folder / "floor.obj"
     path.write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nf 1 2 3\n")
     return path
-
-
-def test_each_of_many_scenes_has_its_own_folder(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("a", "b"):
-        shutil.copytree(room, tmp_path / "house" / name)
-    command = ["reconstruct", str(tmp_path / "house"), f"out={tmp_path / 'out'}", *QUICK[1:]]
-    assert cli.main(command) == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b"]
-    capsys.readouterr()
-    assert cli.main(command) == 0
-    assert "2 of 2 scenes were finished before" in capsys.readouterr().out
-
-
-def test_photographs_are_placed_whatever_lies_in_folders_beside_them(
-    room: Path, ten: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = shutil.copytree(ten, tmp_path / "photographs")
-    shutil.copytree(room, folder / "room")
-    calls = []
-
-    def remembered(pictures: Path, *_: object, **__: object) -> None:
-        calls.append(pictures)
-        raise InputError("stop")
-
-    monkeypatch.setattr("gsencoder.reconstruct.sfm.register_photographs", remembered)
-    assert "stop" in refusal(capsys, str(folder), f"out={folder / 'result'}", "quiet=true")
-    assert calls == [folder]
 
 
 def test_a_disk_without_room_for_the_database_is_told_before_it_fills(

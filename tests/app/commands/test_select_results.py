@@ -11,8 +11,7 @@ from selected_rooms import EMBEDDINGS, read_labels, selected_room, words
 
 from gsencoder.app import main as cli
 from gsencoder.data.splats.files import load_splat
-from gsencoder.data.up import with_up
-from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.folder import WORDS_FILE, save_features
 from gsencoder.infer.select import find_holes, sample_views, select
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.types import Scene
@@ -106,26 +105,6 @@ def test_a_box_that_is_asked_for_and_settings_of_boxes_reach_the_selection(
     common = ("select", str(features), "query=mug", f"out={tmp_path / 'none'}")
     assert "no Gaussian of table is selected" in refusal(capsys, *common, "localize.min_weight=1e30")
     assert "siglip" in refusal(capsys, *common, "head=siglip")
-
-
-def test_results_go_to_a_folder_of_the_scene_and_its_up_is_estimated_where_nobody_knows_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    folder = stored(tmp_path / "features", replace(SCENE, up=None))
-    run(folder, "query=mug", "write=labels", "quiet=true")
-    made = json.loads((tmp_path / "outputs" / "table" / "selection" / "labels.json").read_text())
-    upward = np.array(made["labels"][1]["obb"]["rotation"])[:, 2]
-    known = with_up(load_features(folder))[0].up
-    assert known is not None
-    np.testing.assert_allclose(known, [0, 0, 1], atol=0.1)
-    np.testing.assert_allclose(upward, known, atol=1e-6)
-
-
-def test_no_camera_is_placed_where_no_view_is_looked_at(tmp_path: Path) -> None:
-    folder = stored(tmp_path / "features", replace(SCENE, views=None))
-    run(folder, "query=mug", f"out={tmp_path / 'out'}", "select.views=0", "write=labels", "quiet=true")
-    assert results_of(tmp_path / "out")["placed_cameras"] is False
 
 
 def test_words_are_printed_on_one_line_in_their_own_direction(

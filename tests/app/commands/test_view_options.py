@@ -6,7 +6,6 @@ import re
 from base64 import b64decode
 from dataclasses import replace
 from pathlib import Path
-from shutil import copytree
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,10 +17,8 @@ from viewer_containers import read_container
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands import view
-from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import WORDS_FILE, save_features
 from gsencoder.infer.page.page import Container, jpeg_of
-from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow
 ROOM = room_scene()
@@ -64,9 +61,9 @@ def test_options_of_features_boxes_and_words_reach_the_page(
 ) -> None:
     features = folder / "features"
     limit = ("localize.threshold.kind=fixed", "localize.threshold.fixed=0.9")
-    (scene,), results = written(tmp_path / "a.html", features, *limit, "error=0.03", "megabytes=1")
+    (scene,), results = written(tmp_path / "a.html", features, *limit, "megabytes=1")
     assert {answer["threshold"] for answer in scene.meta["answers"]} == {float(np.float32(0.9))}
-    assert 0.01 < scene.meta["featureError"] <= 0.03
+    assert scene.meta["featureError"] <= 0.01
     assert results["feature_error"] == [scene.meta["featureError"]]
     assert (tmp_path / "a.html").stat().st_size <= 1e6
     assert "not even 1,000" in refusal(capsys, "view", str(features), f"out={tmp_path / 'b.html'}", "megabytes=0.02")
@@ -92,23 +89,6 @@ def test_harmonics_stay_and_the_last_line_names_their_degree(
     assert [scene.meta["title"] for scene in scenes] == [str(each) for each in folders]
 
 
-def test_folders_have_their_names_as_titles_wherever_they_are_called_from(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    copytree(folder / "features", tmp_path / "other")
-    monkeypatch.chdir(tmp_path / "other")
-    scenes, _ = written(tmp_path / "a.html", ".", folder / "features")
-    assert [scene.meta["title"] for scene in scenes] == ["other", "features"]
-
-
-def test_a_summary_that_exists_is_replaced_only_when_told(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "a.html.summary.json").write_text("mine")
-    assert "overwrite=true" in refusal(capsys, "view", str(folder / "features"), f"out={tmp_path / 'a.html'}")
-    assert (tmp_path / "a.html.summary.json").read_text() == "mine"
-
-
 def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -129,17 +109,6 @@ def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(
     )
     assert "has no text encoder" in refused
     assert "none of 'names'" in refusal(capsys, "view", str(tmp_path / "dense"), "space=names")
-
-
-@pytest.mark.parametrize(
-    "option", ["host=::", "host=", "megabytes=0", "megabytes=2000", "photographs=-1", "port=-1", "error=0", "error=1"]
-)
-def test_values_out_of_range_are_refused(
-    folder: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # Where a value is taken by mistake, a file ends and a server would not.
-    arguments = ["view", str(folder / "features"), f"out={tmp_path / 'a.html'}", option]
-    assert f"{option.partition('=')[0]}: expected" in refusal(capsys, *arguments)
 
 
 @pytest.fixture
@@ -170,9 +139,9 @@ def served(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 def test_the_server_gets_the_scene_as_it_is_to_be_searched(
     folder: Path, served: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["max_gaussians=1500", "localize.min_probability=0.1", "port=4321", "host=localhost"]
+    arguments = ["max_gaussians=1500", "localize.min_probability=0.1", "port=4321"]
     assert cli.main(["view", str(folder / "features"), f"photos={folder / 'room'}", *arguments]) == 0
-    assert served.options == {"host": "localhost", "port": 4321}
+    assert served.options == {"port": 4321}
     (search,) = served.searches
     assert len(search.shown.gaussians) == 1500
     assert search.config.min_probability == 0.1
@@ -182,21 +151,6 @@ def test_the_server_gets_the_scene_as_it_is_to_be_searched(
     assert served.closed
     first = capsys.readouterr().out.splitlines()[0]
     assert first.startswith("http://127.0.0.1:1/token/ shows ")
-
-
-def test_options_of_the_photographs_reach_their_scene(
-    folder: Path, served: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sides: list[int] = []
-    load = view.load_scene
-
-    def loading(path: str, *, options: SceneConfig = SceneConfig()) -> Scene:
-        sides.append(options.max_views)
-        return load(path, options=replace(options, max_views=0))
-
-    monkeypatch.setattr(view, "load_scene", loading)
-    assert cli.main(["view", str(folder / "features"), f"photos={folder / 'room'}", "data.max_views=3"]) == 0
-    assert sides == [3]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 
 import pytest
-from command_runs import refusal
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app.commands.ask import scene_folders
@@ -89,14 +88,6 @@ def test_each_kind_of_folder_that_an_option_does_not_take(options: str) -> None:
             assert name in str(error.value)
             assert kind in str(error.value)
             assert expected in str(error.value) or (name == "missing" and "no file at missing" in str(error.value))
-
-
-@pytest.mark.usefixtures("folders")
-def test_features_in_place_of_a_memory_are_said_to_be_those(capsys: pytest.CaptureFixture[str]) -> None:
-    assert refusal(capsys, "export", "memory=fuse", "out=x.onnx") == (
-        "error: fuse: a folder that `gsencoder fuse` wrote, without memory.safetensors; expected a folder with a "
-        "memory, which `gsencoder memory` writes"
-    )
 
 
 @pytest.mark.usefixtures("folders")
