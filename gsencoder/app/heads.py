@@ -76,13 +76,8 @@ def features_for_heads(scene: Scene, heads: HeadSet, space: str = "") -> Gaussia
 
 
 def words_of_head(head: Head, words_file: str, text: TextConfig) -> Words:
-    """The words that a head's outputs are compared with.
-
-    Args:
-        head: a summary head, whose outputs lie in the space of a model with a text side.
-        words_file: a file of words; empty = the vocabulary of `text`.
-        text: the text tower of that model.
-    """
+    """The words that a summary head's outputs are compared with: those of a file, or the vocabulary of `text`, the text
+    tower of the model to whose space the head leads."""
     if not head.text:
         raise InputError(
             f"head {head.describe()}: leads to no model with a text side ({', '.join(TEXT_KINDS)}), so words cannot be "
@@ -110,8 +105,7 @@ def words_of_head(head: Head, words_file: str, text: TextConfig) -> Words:
 
 
 def check_head_words(head: Head, words: Words, tower: TextTower | None) -> None:
-    """Checks that words fit a summary head: its channels, and the kind of its model where it and the tower of the words
-    are known."""
+    """Checks that words fit a summary head: its channels, and the kind of its model where that is known."""
     name = f"head {head.describe()}"
     described = f"the words of {tower.name!r}" if tower is not None else f"the words of {words.space.text_encoder!r}"
     if words.space.channels != head.channels:

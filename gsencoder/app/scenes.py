@@ -56,13 +56,8 @@ def queried_scene(
     words_file: str = "",
     text: TextConfig = TableTextConfig(),
 ) -> tuple[Scene, Words]:
-    """A scene with the one feature set that words are compared with, and the words.
-
-    Args:
-        head: name of an adapter head; empty = the features themselves are asked.
-        space: name of the feature set; empty where there is only one.
-        words_file: a file of words; empty = those beside the features, or for a head those of `text`.
-    """
+    """A scene with the one feature set that words are compared with, and the words: those of a file, or those in the
+    folder of the features; for an adapter head those of `text`."""
     if head:
         # Heads need torch, which finding boxes does without.
         from gsencoder.app.heads import queried_through_head

@@ -129,14 +129,6 @@ def test_inspect_prints_a_table_and_writes_a_summary(tmp_path: Path, capsys: pyt
         assert capsys.readouterr() == ("", f"error: {last}: {said}\n")
 
 
-def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = splat(tmp_path / "good.ply")
-    assert cli.main(["inspect", str(path), "quiet=true", f"out={tmp_path / 'out'}"]) == 0
-    assert cli.main(["repair", str(path), "quiet=true", f"out={tmp_path / 'new.ply'}"]) == 0
-    assert capsys.readouterr() == ("", "")
-    assert (tmp_path / "out" / "summary.json").exists()
-
-
 def test_repair_mends_what_was_asked_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad, new = broken_splat(tmp_path / "bad.ply"), tmp_path / "new.ply"
     with pytest.raises(InputError, match="gsencoder repair"):
@@ -175,15 +167,6 @@ def test_warnings_are_lines_on_stderr_and_entries_of_the_summary(
     lines = [f"{number} images were left out" for number in (1, 1, 2)]
     assert capsys.readouterr().err.splitlines() == [f"warning: {line}" for line in lines]
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["warnings"] == lines
-
-
-def test_a_defect_of_ours_keeps_its_traceback(toy: Any) -> None:
-    def run(config: Any, summary: Any) -> None:
-        raise ZeroDivisionError
-
-    toy(run)
-    with pytest.raises(ZeroDivisionError):
-        cli.main(["toy"])
 
 
 def wrapped(stop: Stopped) -> SystemError:

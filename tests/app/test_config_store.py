@@ -261,9 +261,7 @@ def composed(*words: str) -> TrainCommandConfig:
 @pytest.mark.parametrize("word", ["teacher=palette", "teacher.words=names.npz"])
 def test_options_of_a_single_teacher_are_refused_where_the_experiment_has_several(word: str) -> None:
     key = word.partition("=")[0]
-    with pytest.raises(
-        InputError, match=rf"^{key}: is for a single teacher, and experiment=house gives several, labels, "
-    ):
+    with pytest.raises(InputError, match=rf"^{key}: is for a single teacher, and experiment=house gives several; "):
         composed("experiment=house", word)
     assert composed(word).teachers == {}
 

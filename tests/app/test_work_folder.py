@@ -168,13 +168,3 @@ def test_an_error_before_anything_was_computed_speaks_of_no_state_and_leaves_non
         fail()
     assert getattr(caught.value, "__notes__", []) == []
     assert path.exists() == (not taken)
-
-
-def test_an_error_is_not_lost_where_the_folder_went_away_before_it(tmp_path: Path) -> None:
-    def fail(path: Path) -> None:
-        (path / MARKER_FILE).unlink()
-        path.rmdir()
-        raise InputError("no labels")
-
-    with pytest.raises(InputError, match="^no labels$"):
-        run(tmp_path / "run", fail)

@@ -15,7 +15,7 @@ from textured_box import box_cameras, box_views, write_box
 from gsencoder.app import main as cli
 from gsencoder.data.readers.transforms_json import read_transforms, transforms_of
 from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
+from gsencoder.data.scenes import load_scene, read_posed
 from gsencoder.types import Cameras
 from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
@@ -219,21 +219,6 @@ def test_posed_images_that_are_written_are_read_back(box: Path) -> None:
         assert (after.depth_camera is None) == (before.depth_camera is None)
         if before.depth_from_color is not None:
             np.testing.assert_array_equal(after.depth_from_color, before.depth_from_color)
-
-
-def test_depth_along_the_rays_is_read_as_depth_along_the_axis(box: Path, tmp_path: Path) -> None:
-    views = box_views(few_cameras())
-    lengths = np.linalg.norm(views.cameras.rays(0), axis=2)
-    assert views.depths is not None
-    write_box(tmp_path / "box", replace(views, depths=[(depth * lengths).astype(np.float32) for depth in views.depths]))
-    read = load_scene(tmp_path / "box", options=SceneConfig(depth_measure="ray")).views
-    expected = load_scene(box).views
-    assert read is not None
-    assert expected is not None
-    assert read.depths is not None
-    assert expected.depths is not None
-    for ours, theirs in zip(read.depths, expected.depths, strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1.1e-3)
 
 
 def test_inspect_of_a_folder_shows_each_scene_and_a_splat_beside_none(

@@ -153,23 +153,3 @@ def test_what_cannot_be_done_ends_in_one_line(
     out = tmp_path / "out"
     assert message in refusal(capsys, "select", str(features), f"out={out}", *arguments)
     assert not out.exists()
-
-
-def test_nothing_is_replaced_unless_it_is_asked_for(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    run(features, out, "query=mug", "write=objects")
-    before = (out / "mug.ply").read_bytes()
-    assert "holds the results of an earlier run" in refusal(
-        capsys, "select", str(features), f"out={out}", "query=book", "write=objects"
-    )
-    assert (out / "mug.ply").read_bytes() == before
-    run(features, out, "query=book", "write=objects", "overwrite=true")
-    assert names_in(out) == ["book.ply", "summary.json"]
-    for folder in (features, features.parent):
-        refusal(capsys, "select", str(features), f"out={folder}", "query=mug", "overwrite=true")
-    assert WORDS_FILE in names_in(features)
-    (tmp_path / "file").write_text("mine")
-    assert "is a file" in refusal(capsys, "select", str(features), f"out={tmp_path / 'file'}", "query=mug")
-    assert "expected one folder" in refusal(capsys, "select", str(features), str(features), "query=mug")

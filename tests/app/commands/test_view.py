@@ -53,18 +53,6 @@ def test_a_page_is_written_with_a_summary_of_what_it_holds(folder: Path, built: 
     assert 'id="scene-0"' in out.read_text()
 
 
-def test_a_page_that_exists_is_replaced_only_when_told(
-    folder: Path, built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "page.html"
-    out.write_text("mine")
-    arguments = ["view", str(folder / "features"), f"out={out}"]
-    assert "overwrite=true" in refusal(capsys, *arguments)
-    assert out.read_text() == "mine"
-    assert cli.main([*arguments, "overwrite=true", "quiet=true"]) == 0
-    assert out.read_text().startswith("<!doctype html>")
-
-
 def test_two_folders_are_two_scenes_of_one_page(folder: Path, built: Path, tmp_path: Path) -> None:
     out = tmp_path / "page.html"
     features, copy = folder / "features", tmp_path / "copy"
