@@ -88,7 +88,8 @@ def write_page(folder: Path, scores: ScoreReport, run: Run) -> None:
 
     table = scores.table.without_classes()
     page = HtmlReport(table.title, scores.line)
-    page.facts({name: value for name, value in scores.results.items() if type(value) in (int, float)})
+    figures = {name: value for name, value in scores.results.items() if isinstance(value, int | float)}
+    page.facts({name: value for name, value in figures.items() if not isinstance(value, bool)})
     page.facts(run.costs())
     page.section("Percent", "Rows of papers are of other scenes.")
     rows = [(row.method, row.source, *(cell(row.values.get(name)) for name in table.columns)) for row in table.rows]
