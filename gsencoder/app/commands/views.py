@@ -124,7 +124,7 @@ def run(config: ViewsCommandConfig, run: Run) -> None:
                 with run.step("check"):
                     assert scene.gaussians is not None
                     measured["error"] = choice.realised_error(scene.gaussians, targets)
-            lines = report_budget(run, budget, measured)
+            lines = run.report_budget(budget, measured)
     run.print(*(f"{word}: {text}" for word, text in absent.items()))
     run.print(*(f"{number:2d}  {describe_view(each)}" for number, each in enumerate(views.chosen)))
     run.print(*(f"{out}: {line}" for line in lines))
