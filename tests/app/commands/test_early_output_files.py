@@ -35,7 +35,8 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, names in {
         view: ("load_features", "load_scene"),
         repair: ("read_raw", "load_scene"),
-        export: ("Encoder", "load_memories"),
+        export: ("load_memories",),
+        export.Encoder: ("load",),
     }.items():
         for name in names:
             monkeypatch.setattr(module, name, work)
