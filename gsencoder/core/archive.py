@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -43,10 +42,8 @@ def bytes_of(array: np.ndarray) -> UInt8[np.ndarray, " bytes"]:
     return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
 
 
-def block_checksums(array: np.ndarray) -> str:
-    """The CRC-32 of each block of an array, as one string of hexadecimal digits."""
-    data = bytes_of(array)
-    return "".join(_checksum(data, block) for block in range(-(-len(data) // BLOCK_BYTES)))
+def block_count(size: int) -> int:
+    return -(-size // BLOCK_BYTES)
 
 
 def _checksum(data: UInt8[np.ndarray, " bytes"], block: int) -> str:
@@ -56,24 +53,16 @@ def _checksum(data: UInt8[np.ndarray, " bytes"], block: int) -> str:
 def damaged_blocks(
     data: UInt8[np.ndarray, " bytes"], checksums: str, blocks: Int64[np.ndarray, " n"] | None = None
 ) -> list[int]:
-    """Numbers of the blocks of an array that do not match their checksums.
-
-    Args:
-        blocks: numbers of the blocks to verify; None = all.
-    """
-    count = -(-len(data) // BLOCK_BYTES)
+    """Numbers of the blocks of an array that do not match their checksums, of `blocks` or of all."""
+    count = block_count(len(data))
     if len(checksums) != count * DIGITS:
         return list(range(max(count, 1)))
     numbers = range(count) if blocks is None else blocks.tolist()
     return [n for n in numbers if _checksum(data, n) != checksums[n * DIGITS : (n + 1) * DIGITS]]
 
 
-def file_digest(header: Mapping[str, Any], entries: Mapping[str, tuple[str, tuple[int, ...]]]) -> str:
-    """The SHA-256 over a header (the checksums of all blocks included) and over the types and shapes of the arrays.
-
-    Args:
-        entries: type and shape of each array.
-    """
+def file_digest(header: Mapping[str, Any], entries: "Entries") -> str:
+    """The SHA-256 over a header (the checksums of all blocks included) and over the types and shapes of the arrays."""
     arrays = {name: [dtype, list(shape)] for name, (dtype, shape) in entries.items()}
     return hashlib.sha256(json.dumps([header, arrays], sort_keys=True).encode()).hexdigest()
 
@@ -99,32 +88,20 @@ Entries = Mapping[str, tuple[str, tuple[int, ...]]]
 
 
 def array_offsets(stream: BinaryIO) -> dict[str, tuple[int, int]]:
-    """The first byte of each array in the file, and the byte after its last.
-
-    Args:
-        stream: of the file, whose header the library has accepted.
-    """
-    length = int.from_bytes(read_bytes(stream, (0, 8)).tobytes(), "little")
-    text = read_bytes(stream, (8, 8 + min(length, HEADER_LIMIT))).tobytes()
+    """The first byte of each array in a file whose header the library has accepted, and the byte after its last."""
+    length = int.from_bytes(read_bytes(stream, 0, 8).tobytes(), "little")
+    begin = 8 + length
+    text = read_bytes(stream, 8, min(begin, HEADER_LIMIT)).tobytes()
     try:
         table = json.loads(text)
-        begin = 8 + length
-        return {
-            name: (begin + entry["data_offsets"][0], begin + entry["data_offsets"][1])
-            for name, entry in table.items()
-            if name != "__metadata__"
-        }
+        spans = {name: entry["data_offsets"] for name, entry in table.items() if name != "__metadata__"}
+        return {name: (begin + span[0], begin + span[1]) for name, span in spans.items()}
     except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         raise InputError("was cut off or replaced while its header was read; give the command again") from error
 
 
-def read_bytes(stream: BinaryIO, span: tuple[int, int]) -> UInt8[np.ndarray, " bytes"]:
-    """The bytes of a part of a file; fewer where the file ends before.
-
-    Args:
-        span: its first byte, and the byte after its last.
-    """
-    first, last = span
+def read_bytes(stream: BinaryIO, first: int, last: int) -> UInt8[np.ndarray, " bytes"]:
+    """The bytes from `first` to before `last` of a file; fewer where the file ends before."""
     data = np.empty(max(last - first, 0), np.uint8)
     stream.seek(first)
     done = 0
@@ -135,10 +112,8 @@ def read_bytes(stream: BinaryIO, span: tuple[int, int]) -> UInt8[np.ndarray, " b
 
 
 def write_safetensors(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Writes the bytes that `safetensors.numpy.save` gives, without a second copy of the arrays in memory.
-
-    The library's `save_file` writes a file of a random name first, which a kill leaves in the folder for good.
-    """
+    """Writes the bytes of `safetensors.numpy.save`, without a second copy of the arrays in memory. The library's
+    `save_file` writes a file of a random name first, which a kill leaves in the folder for good."""
     entries = entries_of(arrays)
     with atomic_file(path) as stream:
         stream.write(safetensors_header(entries, metadata))
@@ -152,7 +127,6 @@ def entries_of(arrays: Mapping[str, np.ndarray]) -> Entries:
 
 
 def _file_order(entries: Entries) -> list[str]:
-    """The names of arrays in the order in which they stand in the file."""
     return sorted(entries, key=lambda name: (ORDER.index(NAMES_OF_DTYPES[entries[name][0]]), name))
 
 
@@ -172,8 +146,7 @@ def safetensors_header(entries: Entries, metadata: Mapping[str, str]) -> bytes:
 
 VERSION = 2
 RESERVED_KEYS = ("version", "checksums", "digest")
-"""Keys of the header that callers may not use: version, checksums of the blocks by array, and the digest of the rest.
-"""
+"""Keys of the header that callers may not use: the digest is of all others."""
 LARGEST_NUMBER = 2.0**63
 LONGEST_NUMBER = -2.2250738585072014e-308
 """JSON writes no number in more characters: it stands for numbers of a header that are not known yet."""
@@ -186,15 +159,11 @@ class Archive:
     """An open archive; arrays and header values are validated as they are read.
 
     Attributes:
-        path: of the file, for messages.
         sizes: values of the letters in shapes, as set by the arrays that were read so far.
     """
 
     def __init__(self, path: Path, file: Any, stream: BinaryIO, header: dict[str, Any]) -> None:
-        """Args:
-        file: the file, opened by safetensors, for names, types and shapes.
-        stream: the file, from which arrays are read.
-        """
+        """`file` is that of safetensors, for names, types and shapes; arrays are read from `stream`."""
         self.path, self.sizes = path, dict[str, int]()
         self._file, self._header, self._names = file, header, frozenset(file.keys())
         self._stream, self._offsets = stream, array_offsets(stream)
@@ -210,16 +179,8 @@ class Archive:
 
     def array(self, name: str, dtype: str, shape: tuple[int | str, ...]) -> np.ndarray:
         """Reads an array; a letter in its shape stands for the same size in all arrays of the file."""
-        got_dtype, got = self._stored(name)
         expected = tuple(self.sizes.get(side, side) if isinstance(side, str) else side for side in shape)
-        same = len(got) == len(expected) and all(
-            isinstance(e, str) or e == g for e, g in zip(expected, got, strict=True)
-        )
-        if got_dtype != dtype or not same:
-            raise InputError(
-                f"{self.path}: expected {name} {dtype}[{_listed(expected)}], got {got_dtype}[{_listed(got)}]; "
-                "the file is damaged or from another program"
-            )
+        got = self._checked_shape(name, dtype, expected)
         self.sizes |= {side: size for side, size in zip(expected, got, strict=True) if isinstance(side, str)}
         values = self._read(name)
         if values.dtype.kind == "f" and not np.isfinite(values).all():
@@ -229,30 +190,31 @@ class Archive:
 
     def shape(self, name: str, dtype: str, axes: int) -> tuple[int, ...]:
         """The shape of an array, without reading it."""
-        got_dtype, shape = self._stored(name)
-        if got_dtype != dtype or len(shape) != axes:
+        return self._checked_shape(name, dtype, ("?",) * axes)
+
+    def _checked_shape(self, name: str, dtype: str, expected: tuple[int | str, ...]) -> tuple[int, ...]:
+        """The shape of an array, whose sides are those expected; a letter stands for any size."""
+        got_dtype, got = self._stored(name)
+        same = len(got) == len(expected) and all(
+            isinstance(wanted, str) or wanted == side for wanted, side in zip(expected, got, strict=True)
+        )
+        if got_dtype != dtype or not same:
             raise InputError(
-                f"{self.path}: expected {name} {dtype} with {axes} axes, got {got_dtype}[{_listed(shape)}]; "
+                f"{self.path}: expected {name} {dtype}[{_listed(expected)}], got {got_dtype}[{_listed(got)}]; "
                 "the file is damaged or from another program"
             )
-        return shape
+        return got
 
     def _read(self, name: str) -> np.ndarray:
-        values = self._values(name)
-        if damaged_blocks(bytes_of(values), self.checksums[name]):
-            raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
-        return values
-
-    def _values(self, name: str) -> np.ndarray:
         # Not through the memory map of safetensors, which ends the process where the file is cut off meanwhile.
         dtype, shape = self._stored(name)
-        if dtype not in DTYPES.values():
-            raise InputError(
-                f"{self.path}: {name} is of the type {dtype}, expected one of {', '.join(DTYPES.values())}"
-            )
-        data = read_bytes(self._stream, self._offsets.get(name, (0, 0)))
+        if dtype not in NAMES_OF_DTYPES:
+            raise InputError(f"{self.path}: {name} has type {dtype}, expected one of {', '.join(NAMES_OF_DTYPES)}")
+        data = read_bytes(self._stream, *self._offsets.get(name, (0, 0)))
         if len(data) != np.dtype(dtype).itemsize * math.prod(shape):
             raise InputError(f"{self.path}: was cut off or replaced while {name} was read; give the command again")
+        if damaged_blocks(data, self.checksums[name]):
+            raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
         return data.view(dtype).reshape(shape)
 
     def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
@@ -308,34 +270,30 @@ def _listed(shape: tuple[int | str, ...]) -> str:
 
 
 def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
-    """Writes arrays and header with their checksums; an existing file is replaced once the new one is complete.
-
-    Args:
-        arrays: by name, of the types in `DTYPES`.
-        header: JSON values, under other keys than `RESERVED_KEYS`.
-    """
-    pieces = {name: _contiguous(array) for name, array in arrays.items()}
+    """Writes arrays of the types in `DTYPES` and a header of JSON values with their checksums; an existing file is
+    replaced once the new one is complete."""
+    # np.ascontiguousarray alone gives a scalar an axis.
+    pieces = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
     assert not set(RESERVED_KEYS) & set(header)
-    assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that cannot be read back"
-    checksums = {name: block_checksums(array) for name, array in pieces.items()}
+    assert all(array.dtype.name in NAMES_OF_DTYPES for array in pieces.values()), "a type that cannot be read back"
+    checksums = {}
+    for name, array in pieces.items():
+        data = bytes_of(array)
+        checksums[name] = "".join(_checksum(data, block) for block in range(block_count(len(data))))
     write_safetensors(path, pieces, _metadata(entries_of(pieces), checksums, header))
 
 
 def archive_bytes(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> int:
-    """The size of the file that `write_archive` would write.
-
-    Args:
-        arrays: by name; values do not matter, so that arrays of `shape_only` will do.
-        header: as it would be written; numbers of other lengths change the size by as many bytes.
-    """
+    """The size of the file that `write_archive` would write; values of arrays do not matter, so that arrays of
+    `shape_only` will do."""
     entries = entries_of(arrays)
     sizes = {name: math.prod(shape) * np.dtype(dtype).itemsize for name, (dtype, shape) in entries.items()}
-    checksums = {name: "0" * (DIGITS * -(-size // BLOCK_BYTES)) for name, size in sizes.items()}
+    checksums = {name: "0" * (DIGITS * block_count(size)) for name, size in sizes.items()}
     return len(safetensors_header(entries, _metadata(entries, checksums, header))) + sum(sizes.values())
 
 
 def shape_only(dtype: str, shape: tuple[int, ...]) -> np.ndarray:
-    """An array of zeros that takes no memory: it stands for one of its type and shape in `archive_bytes`."""
+    """An array of zeros that takes no memory."""
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
@@ -345,15 +303,9 @@ def _metadata(entries: Entries, checksums: Mapping[str, str], header: Mapping[st
     return {"gsencoder": json.dumps({**covered, "digest": file_digest(covered, entries)})}
 
 
-def _contiguous(array: np.ndarray) -> np.ndarray:
-    """A contiguous copy of the same shape; np.ascontiguousarray alone gives a scalar an axis."""
-    return np.ascontiguousarray(array).reshape(array.shape)
-
-
 @contextmanager
 def open_archive(path: Path) -> Iterator[Archive]:
-    """Opens the file at `path` for the block. An `InputError` in the block that does not name the file is prefixed with
-    its path, so that errors of validation say which file they are about."""
+    """Opens a file for the block; an `InputError` in the block that does not name it is prefixed with its path."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -361,9 +313,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
     try:
         with about(path), path.open("rb", buffering=0) as stream, safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
-            if not isinstance(header, dict):
-                raise InputError(f"{path}: expected version {VERSION} of the format, got none")
-            yield Archive(path, file, stream, header)
+            yield Archive(path, file, stream, header if isinstance(header, dict) else {})
     except InputError:
         raise
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
@@ -380,20 +330,12 @@ def verify_archive(path: Path) -> None:
 
 class MappedArrays:
     """Read-only arrays of a file. A block is verified against its checksum when it is first used, and not again; values
-    are not validated otherwise.
-
-    The system ends a process that reads a page of the map beyond the end of the file (SIGBUS). So the size of the file
-    is compared whenever an array is asked for, which leaves the moment in which its values are used.
-    """
+    are not validated otherwise. The size of the file is compared whenever an array is asked for (SIGBUS, see above),
+    which leaves the moment in which its values are used."""
 
     def __init__(self, path: Path, types: Mapping[str, tuple[str, int]], earlier: "MappedArrays | None" = None) -> None:
-        """Maps the file.
-
-        Args:
-            types: dtype and number of axes of each array.
-            earlier: a closed map of these arrays; blocks that it verified are not verified again if the file has not
-                been written since.
-        """
+        """Maps arrays of these types and numbers of axes. Blocks that `earlier`, a closed map of them, verified are not
+        verified again if the file has not been written since."""
         self.path = path
         with open_archive(path) as file:
             shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in types.items()}
@@ -410,7 +352,7 @@ class MappedArrays:
             first, last = offsets[name]
             self._bytes[name] = raw[first:last]
             self._arrays[name] = self._bytes[name].view(dtype).reshape(shapes[name])
-        blocks = {name: -(-len(data) // BLOCK_BYTES) for name, data in self._bytes.items()}
+        blocks = {name: block_count(len(data)) for name, data in self._bytes.items()}
         self._unchecked = {name: np.ones(count, bool) for name, count in blocks.items() if count}
         if earlier is not None and earlier._stamp == self._stamp:
             self._unchecked = earlier._unchecked
@@ -475,8 +417,6 @@ LARGEST_ARRAY = 1 << 29
 """Largest size of an array, bytes: a thousand masks of half a million vertices."""
 MAX_TEXT = 1 << 12
 """Largest number of characters of an entry of a text array; numpy stores all entries with the length of the longest."""
-
-
 _KINDS = {"U": "text", "f": "floating point", "b": "bool", "i": "signed integers", "u": "unsigned integers"}
 """What messages call numpy's kinds of types."""
 
@@ -491,10 +431,8 @@ def read_npz(
     """Reads arrays of an .npz by name.
 
     Args:
-        required: kind of type ("U" text, "f" floating point, "b" bool, "i" and "u" integers) and number of axes of each
-            array.
+        required: kind of type (a key of `_KINDS`) and number of axes of each array.
         optional: the same for arrays that may be missing.
-        max_text: largest number of characters of an entry of text.
     """
     try:
         check_foreign(file)
@@ -538,22 +476,14 @@ def _read_member(archive: zipfile.ZipFile, name: str, kind: str, ndim: int, file
 
 
 class RowFile:
-    """Rows that are appended part by part and then read as one array, whose pages the system loads and drops.
-
-    The file is in the folder for temporary files (TMPDIR) and has no name, so that it goes with the process.
-    """
+    """Rows that are appended part by part and then read as one array, whose pages the system loads and drops. The file
+    is in the folder for temporary files (TMPDIR) and has no name, so that it goes with the process."""
 
     def __init__(self, channels: int) -> None:
-        """Args:
-        channels: of a row.
-        """
         self._channels, self._count = channels, 0
         self._file = TemporaryFile()  # noqa: SIM115
 
     def append(self, rows: Float32[np.ndarray, "n D"]) -> None:
-        """Adds rows after those that are there."""
-        if rows.shape[1] != self._channels:
-            raise InputError(f"rows: expected {self._channels} channels, got {rows.shape[1]}")
         try:
             self._file.write(np.ascontiguousarray(rows, np.float32).tobytes())
             self._file.flush()
@@ -573,19 +503,13 @@ class RowFile:
     def __enter__(self) -> "RowFile":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._file.close()
 
 
 def copy_checked(source: Path, target: Path, check: Callable[[Path], object]) -> None:
-    """Copies a file and checks the copy, since the source may have been cut off while it was copied. An earlier target
-    is replaced once the copy is complete and checked.
-
-    Args:
-        check: reads the copy; raises InputError where it is damaged.
-    """
+    """Copies a file and checks the copy, since the source may have been cut off while it was copied: `check` reads it
+    and raises InputError where it is damaged. An earlier target is replaced then."""
     with atomic_file(target) as stream:
         with readable(source), open_foreign(source) as original:
             shutil.copyfileobj(original, stream)

@@ -77,13 +77,7 @@ def check_any_limit(budget: Budget) -> None:
 def reject_options_set_by_budget(
     budget: Budget, settings: object, default: object, keys: Iterable[str], section: str
 ) -> None:
-    """Refuses options that a budget chooses where they are set by hand.
-
-    Args:
-        default: such settings with every option at its default.
-        keys: of the options, with dots between sections.
-        section: that the settings are on the command line.
-    """
+    """Refuses options (`keys`, with dots between sections) that a budget chooses where they differ from the default."""
     for key in keys if budget.limits else ():
         if (value := value_at(settings, key)) != value_at(default, key):
             raise InputError(
@@ -94,18 +88,13 @@ def reject_options_set_by_budget(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """What a sample says of a setting; NaN = not measured.
-
-    Attributes:
-        error: predicted for the whole.
-        bound: what the error stays below in all likelihood.
-        seconds: from the beginning of the choice to the result.
-        megabytes: of the result.
-    """
+    """What a sample says of a setting; NaN = not measured."""
 
     error: float = nan
     bound: float = nan
+    """What the error stays below in all likelihood."""
     seconds: float = nan
+    """From the beginning of the choice to the result."""
     megabytes: float = nan
 
 
@@ -122,12 +111,7 @@ Setting = TypeVar("Setting")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choice(Generic[Setting]):
-    """The setting that a budget chose.
-
-    Attributes:
-        estimate: of the setting.
-        notes: warnings about limits that it is expected to break.
-    """
+    """The setting that a budget chose, and warnings about limits that it is expected to break."""
 
     setting: Setting
     estimate: Estimate
@@ -141,8 +125,6 @@ def choose(settings: Sequence[Setting], measure: Callable[[Setting], Estimate], 
 
     Args:
         settings: cheapest first, the exact one last, which keeps any error.
-        measure: what a sample says of a setting.
-        budget: one limit or more.
 
     Raises:
         InputError: not even the first setting keeps the limit of megabytes, and no error is limited.

@@ -11,11 +11,8 @@ from gsencoder.core.process import Device, Precision
 
 
 def choose_device(name: Device, local_rank: int = 0) -> torch.device:
-    """The device of a process: with "auto" a GPU if torch sees one, else the CPU.
-
-    Args:
-        local_rank: number of the process on its machine; each process takes another GPU.
-    """
+    """The device of a process: with "auto" a GPU if torch sees one, else the CPU. Each process of a machine takes
+    another GPU."""
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"device: expected auto, cpu or cuda, got {name!r}")
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
@@ -45,27 +42,19 @@ def autocast_dtype(precision: Precision, device: torch.device, *, training: bool
 
 
 def teacher_autocast(device: str) -> torch.autocast:
-    """The context in which a teacher runs: bfloat16 on GPUs that compute in it, float32 elsewhere.
-
-    On a CPU its maps are those of its library.
-    """
+    """The context in which a teacher runs: bfloat16 on GPUs that compute in it, float32 elsewhere."""
     enabled = device == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
     return torch.autocast(device, torch.bfloat16, enabled=enabled)
 
 
 @contextmanager
 def enough_memory(subject: str, remedy: str) -> Iterator[None]:
-    """Turns a lack of GPU memory into an error that says what needs less.
-
-    Args:
-        remedy: the option that makes it need less.
-    """
+    """Turns a lack of GPU memory into an error that names the option that lowers it."""
     try:
         yield
     except torch.OutOfMemoryError as error:
-        raise InputError(
-            f"{subject}: the GPU has not enough memory; lower {remedy} or give teacher.device=cpu"
-        ) from error
+        message = f"{subject}: the GPU has not enough memory; lower {remedy} or give teacher.device=cpu"
+        raise InputError(message) from error
 
 
 def to_device(value: Any, device: torch.device) -> Any:

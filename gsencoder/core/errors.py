@@ -57,13 +57,9 @@ def advised(advice: str) -> Iterator[None]:
 
 @contextmanager
 def renamed_options(section: str, typed: str, options: Iterable[str]) -> Iterator[None]:
-    """Names options in the message of an `InputError` that leaves the block by the keys that are typed for them.
-
-    Args:
-        section: the section that messages name, such as teacher in teacher.model.
-        typed: the section that the user has to type, such as teachers.clip.
-        options: names of the section's options; other words that begin like it, such as files, are left as they are.
-    """
+    """Names `options` of a section in the message of an `InputError` that leaves the block by the keys that are typed
+    for them: with section teacher and typed teachers.clip, teacher.model becomes teachers.clip.model. Other words that
+    begin like the section, such as files, are left as they are."""
     try:
         yield
     except InputError as error:

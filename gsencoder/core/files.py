@@ -2,7 +2,6 @@
 
 import csv
 import errno
-import hashlib
 import io
 import json
 import math
@@ -33,33 +32,25 @@ def lock_folder(folder: str | Path, *, wait: bool = False) -> int | None:
     """Locks a folder and returns the open descriptor; the system releases the lock when it is closed or the process
     ends. None where folders cannot be locked (some network file systems).
 
-    Args:
-        wait: whether to wait until another run releases its lock.
-
     Raises:
-        BlockingIOError: another run holds the lock.
+        BlockingIOError: another run holds the lock, and `wait` is false.
     """
     if fcntl is None:
         return None
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
+    except BaseException as error:
         os.close(descriptor)
-        raise
-    except OSError:
-        os.close(descriptor)
-        return None
-    except BaseException:
-        os.close(descriptor)
+        if isinstance(error, OSError) and not isinstance(error, BlockingIOError):
+            return None
         raise
     return descriptor
 
 
 @contextmanager
 def locked(folder: str | Path, *, wait: bool = False) -> Iterator[bool]:
-    """Locks a folder for the block; gives whether it could be locked. Arguments and errors are those of
-    `lock_folder`."""
+    """Locks a folder for the block, as `lock_folder` does; gives whether it could be locked."""
     descriptor = lock_folder(folder, wait=wait)
     try:
         yield descriptor is not None
@@ -73,25 +64,15 @@ def is_full_disk(error: BaseException) -> bool:
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return True
     # numpy reports "4096 requested and 100 written"; safetensors quotes the system's message in its error.
-    short = (
-        isinstance(error, OSError) and error.errno is None and re.search(r"\d+ requested and \d+ written", str(error))
-    )
+    short = isinstance(error, OSError) and re.search(r"\d+ requested and \d+ written", str(error))
     return bool(short) or os.strerror(errno.ENOSPC) in str(error)
-
-
-def full_disk(path: str | Path) -> WriteError:
-    """The error of a file for which there is no room."""
-    return WriteError(f"{path}: no space left on the device; make room and give the command again")
 
 
 @contextmanager
 def temporary_beside(target: Path) -> Iterator[Path]:
     """A file of a hidden name in the folder of `target`, to write and then to rename to it; it is removed at the end of
-    the block if it is still there.
-
-    The name is the same every time, so that the file that a killed run left is written over by the next and not left
-    for good. The file is locked; a second run that writes the same target meanwhile gets a name of its own.
-    """
+    the block if it is still there. The name is the same every time, so that the next run writes over what a killed one
+    left. The file is locked; a second run that writes the same target meanwhile gets a name of its own."""
     path = target.parent / f".{short_name(target.name)}.tmp"
     descriptor = _locked_file(path)
     if descriptor is None:
@@ -149,11 +130,8 @@ def _locked_file(path: Path) -> int | None:
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
-    """Opens a binary file that appears at `path` only if the block ends without an error.
-
-    It is written under a temporary name in the same folder, synced to disk and renamed, so that a kill or a full disk
-    leaves an earlier file as it was.
-    """
+    """Opens a binary file that appears at `path` only if the block ends without an error: it is written under a
+    temporary name in the same folder, synced to disk and renamed."""
     target = Path(path)
     with _named_errors(target):
         _check_folder(target)
@@ -190,41 +168,29 @@ def _named_errors(target: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if is_full_disk(error):
-            raise full_disk(target) from error
+            message = f"{target}: no space left on the device; make room and give the command again"
+            raise WriteError(message) from error
         raise WriteError(f"{target}: cannot write: {error.strerror or error}") from error
 
 
 def plain(value: Any, where: str = "", lost: list[str] | None = None) -> Any:
-    """Converts `value` to JSON types: numpy values, paths, tuples and dataclasses are converted, non-finite numbers
-    null.
-
-    Args:
-        value: nested lists, tuples, mappings and dataclasses of such values.
-        where: the dotted name of `value`, for `lost`.
-        lost: collects the dotted names of the numbers that were not finite.
-
-    Raises:
-        TypeError: a value of another type; it is named.
-    """
+    """Converts numpy values, paths, sequences, mappings and dataclasses, however nested, to JSON types. Numbers that
+    are not finite become null; `lost` collects their dotted names, which begin with `where`."""
 
     def inside(name: object, item: Any) -> Any:
         return plain(item, f"{where}.{name}" if where else str(name), lost)
 
-    if value is None or isinstance(value, (bool, str)):
+    if value is None or isinstance(value, (bool, str, int)):
         return value
-    if isinstance(value, (int, np.integer)):
-        return int(value)
     if isinstance(value, (float, np.floating)):
         if math.isfinite(value):
             return float(value)
         if lost is not None:
             lost.append(where or "value")
         return None
-    if isinstance(value, np.bool_):
-        return bool(value)
     if isinstance(value, Path):
         return str(value)
-    if isinstance(value, np.ndarray):
+    if isinstance(value, (np.ndarray, np.generic)):
         return plain(value.tolist(), where, lost)
     if isinstance(value, Mapping):
         return {str(name): inside(name, item) for name, item in value.items()}
@@ -250,10 +216,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Writes a JSON file atomically; values are converted as by `plain`.
-
-    Numbers that are not finite become null, with one counted `SceneWarning` that names them.
-    """
+    """Writes a JSON file atomically; values are converted as by `plain`, with one warning about lost numbers."""
     data, lost = json_bytes(value)
     if lost:
         warnings.warn(
@@ -286,20 +249,14 @@ PNG_LEVEL = 3
 
 
 def write_picture(path: Path, picture: Image.Image | np.ndarray, **options: Any) -> None:
-    """Writes a picture in the format of the file's suffix; an existing file is replaced.
-
-    It is encoded in memory: on a disk that is nearly full, encoders of Pillow that write into a file themselves pass
-    over what it did not take.
-
-    Args:
-        picture: a picture, or an array of one that Pillow takes: uint8 [H, W, 3], uint8 [H, W] or uint16 [H, W].
-        options: of Pillow's encoder; PNG files are compressed at `PNG_LEVEL` without one.
-    """
+    """Writes a picture, or uint8 [H, W, 3], uint8 [H, W] or uint16 [H, W], in the format of the file's suffix, with
+    options of Pillow's encoder. It is encoded in memory: encoders of Pillow that write into a file themselves pass over
+    what a disk that is nearly full did not take."""
     write_bytes(path, picture_bytes(picture, path.suffix, **options))
 
 
 def picture_bytes(picture: Image.Image | np.ndarray, suffix: str, **options: Any) -> bytes:
-    """What `write_picture` writes into a file of this suffix, such as ".png"; its other arguments."""
+    """What `write_picture` writes into a file of this suffix, such as ".png"."""
     held = io.BytesIO()
     image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
     kind = Image.registered_extensions()[suffix.lower()]
@@ -329,19 +286,17 @@ def open_foreign(path: str | Path, max_bytes: int | None = None) -> BinaryIO:
 
 
 def check_foreign(path: str | Path, max_bytes: int | None = None) -> None:
-    """Checks what `open_foreign` does, of a file that a library opens by its name."""
+    """The checks of `open_foreign`, of a file that a library opens by its name."""
     _check(path, os.stat(path), max_bytes)
 
 
 def read_foreign(path: str | Path, max_bytes: int = TEXT_BYTES) -> bytes:
-    """The bytes of a file; errors as those of `open_foreign`."""
     with open_foreign(path, max_bytes) as stream:
         return stream.read()
 
 
 def read_foreign_text(path: str | Path, max_bytes: int = TEXT_BYTES) -> str:
-    """The text of a file in UTF-8, with or without a byte order mark, any line ends as \\n; errors as those of
-    `open_foreign`, and UnicodeDecodeError."""
+    """The text of a file in UTF-8, with or without a byte order mark, any line ends as \\n."""
     return read_foreign(path, max_bytes).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -354,7 +309,6 @@ def _check(path: str | Path, status: os.stat_result, max_bytes: int | None) -> N
 
 
 SUMMARY_NAME = "summary.json"
-BLOCK_BYTES = 1 << 22
 LARGEST_HEADER = 1 << 24
 LARGEST_SUMMARY = 1 << 26
 LEVELS = 3
@@ -363,9 +317,9 @@ LEVELS = 3
 
 def sha256_of(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal digits."""
-    digest = hashlib.sha256()
+    digest = sha256()
     with open_foreign(path) as stream:
-        while block := stream.read(BLOCK_BYTES):
+        while block := stream.read(1 << 22):
             digest.update(block)
     return digest.hexdigest()
 
@@ -382,7 +336,7 @@ def checksums_of(folder: Path) -> dict[str, str]:
 
 
 def _is_archive(path: Path) -> bool:
-    """Whether a file is an archive of this package (`core.files.archive`), which has checksums."""
+    """Whether a file is an archive of this package, which has checksums."""
     if path.suffix != ".safetensors":
         return False
     with open_foreign(path) as stream:
@@ -391,12 +345,8 @@ def _is_archive(path: Path) -> bool:
 
 
 def check_written(path: str | Path) -> None:
-    """Compares a file with the checksum that the run which wrote it left in its summary, in the file's folder or above,
-    or as FILE.summary.json beside it. A file without one is not checked.
-
-    Warns:
-        SceneWarning: the file is not as it was written.
-    """
+    """Warns if a file differs from the checksum that the run which wrote it left in its summary, in the file's folder
+    or above, or in FILE.summary.json; a file without one is not checked."""
     file = Path(path).absolute()
     summaries = [Path(f"{file}.{SUMMARY_NAME}"), *(folder / SUMMARY_NAME for folder in list(file.parents)[:LEVELS])]
     for summary in summaries:
@@ -406,8 +356,7 @@ def check_written(path: str | Path) -> None:
         try:
             same = sha256_of(file) == stated
         except (OSError, InputError):
-            # Whoever reads it says so.
-            return
+            return  # Whoever reads it says so.
         if not same:
             warnings.warn(
                 f"{path}: is not as it was written: its checksum in {summary} is another; it was edited since, or is "
@@ -452,14 +401,9 @@ UNFINISHED_FILE = "unfinished.txt"
 
 def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:
     """The file that an option of several scenes names: in each scene's own folder, or else from here. `{scene}` in it
-    stands for the name of the scene's folder, as in splats/{scene}/splat.ply.
-
-    Raises:
-        InputError: neither exists.
-    """
+    stands for the name of the scene's folder, as in splats/{scene}/splat.ply."""
     name = str(name).replace("{scene}", folder.name)
     try:
-        # An absolute path stays itself.
         for path in (folder / name, Path(name)):
             if path.exists():
                 return path

@@ -67,14 +67,12 @@ class Log:
     """Writes a row of numbers for each step. The file is closed after every row, so that a kill loses none."""
 
     def __init__(self, folder: Path, *, done: int, events: bool, begun: bool = False) -> None:
-        """Args:
-        folder: of the log; rows of steps that will be repeated are removed.
-        done: number of completed steps; a row holds the number of steps that were completed when it was written.
-        events: whether to write TensorBoard events too.
-        begun: whether an earlier run wrote rows.
+        """Removes the rows of steps after `done`, which will be repeated; a row holds the number of steps that were
+        completed when it was written.
 
-        Warns:
-            SceneWarning: an earlier run wrote rows, and the file is missing.
+        Args:
+            events: whether to write TensorBoard events too.
+            begun: whether an earlier run wrote rows: a missing file is warned of.
         """
         self.path = folder / LOG_FILE
         self._columns: list[str] = []
@@ -83,19 +81,14 @@ class Log:
         try:
             if begun and not self.path.is_file():
                 warnings.warn(f"{self.path}: is missing; the log starts at step {done}", SceneWarning, stacklevel=2)
-            self._drop_rows_after(done)
+            before = read_log(self.path) if self.path.is_file() else []
+            rows = [row for row in before if int(row["step"]) <= done]
+            self._columns = list(dict.fromkeys(name for row in rows for name in row))
+            self._rewrite(rows)
         except InputError:
             raise
         except (OSError, ValueError, KeyError, csv.Error) as error:
             raise InputError(f"{self.path}: cannot be continued: {error}") from error
-
-    def _drop_rows_after(self, done: int) -> None:
-        if not self.path.is_file():
-            self._rewrite([])
-            return
-        rows = [row for row in read_log(self.path) if int(row["step"]) <= done]
-        self._columns = list(dict.fromkeys(name for row in rows for name in row))
-        self._rewrite(rows)
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
         """Appends a row; every number is also a TensorBoard scalar."""

@@ -123,14 +123,7 @@ def defer_signals() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessRank:
-    """The rank of a process among those that one launcher started.
-
-    Attributes:
-        rank: its number among all processes, from 0.
-        world_size: number of processes.
-        local_rank: its number among the processes of its machine.
-        local_world_size: number of processes of its machine; 1 where the launcher does not state it.
-    """
+    """The rank of a process among those that one launcher started, and among those of its machine."""
 
     rank: int = 0
     world_size: int = 1
@@ -144,11 +137,8 @@ class ProcessRank:
 
 
 def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, str]:
-    """Reads the rank of this process from environment variables of torchrun or SLURM.
-
-    Returns:
-        The rank, and the init_method for `torch.distributed`: "tcp://…" under SLURM, "env://" under torchrun, else "".
-    """
+    """The rank of this process, and the init_method for `torch.distributed`: "tcp://…" under SLURM, "env://" under
+    torchrun, else ""."""
     if "RANK" in environment and "WORLD_SIZE" in environment:
         names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
         rank, size, local = (_read_number(environment, name, "0") for name in names)
@@ -188,11 +178,7 @@ def store_address(environment: Mapping[str, str], init_method: str) -> tuple[str
 
 
 def refuse_several(subject: str, advice: str) -> None:
-    """Checks that a launcher started this process alone, for work that is not shared: all would write the same results.
-
-    Args:
-        subject: what runs in one process, for the error.
-    """
+    """Checks that a launcher started this process alone, for work that is not shared: all would write the same."""
     process, _ = rank_from_environment(os.environ)
     if process.world_size > 1:
         raise InputError(
@@ -241,14 +227,8 @@ _running: ContextVar["Clock | None"] = ContextVar("running_clock", default=None)
 
 
 class Clock:
-    """Adds up the seconds that each step of a stage takes.
-
-    A step is a block, `with clock("lift"): …`, or, between `with clock.running():`, a call of a function that is
-    decorated with `@timed("lift")`.
-
-    Attributes:
-        seconds: by step, in order of first start.
-    """
+    """Adds up the seconds that each step of a stage takes. A step is a block, `with clock("lift"): …`, or, within
+    `with clock.running():`, a call of a function that is decorated with `@timed("lift")`."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -297,11 +277,7 @@ STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Growth:
-    """The result of `memory_growth`, set when its block ends.
-
-    Attributes:
-        mib: peak resident memory minus that at the start, MiB; NaN where the system does not report it.
-    """
+    """Peak resident memory of a block minus that at its start, MiB; NaN where the system does not report it."""
 
     def __init__(self) -> None:
         self.mib = math.nan
@@ -309,12 +285,8 @@ class Growth:
 
 @contextmanager
 def memory_growth() -> Iterator[Growth]:
-    """Measures the memory of a block, which may run many times in one process.
-
-    Linux records the peak of resident memory of each process (VmHWM) and can reset it to the present value. Freed heap
-    memory is returned to the system first, so that the block cannot reuse what an earlier one freed. On other systems
-    the result is NaN.
-    """
+    """Measures the memory of a block. Linux records the peak of resident memory of each process (VmHWM) and can reset
+    it to the present value. Freed heap memory is returned to the system first, so that the block cannot reuse it."""
     growth = Growth()
     gc.collect()
     with suppress(OSError, AttributeError):
@@ -329,11 +301,11 @@ def memory_growth() -> Iterator[Growth]:
     growth.mib = max(_kib("VmHWM") - before, 0) / 1024
 
 
-def _kib(name: str) -> int:
-    for line in STATUS.read_text().splitlines():
+def _kib(name: str, file: Path | None = None) -> int:
+    for line in (file or STATUS).read_text().splitlines():
         if line.startswith(name + ":"):
             return int(line.split()[1])
-    raise OSError(f"{STATUS} has no {name}")
+    raise OSError(f"{file or STATUS} has no {name}")
 
 
 MEMINFO = Path("/proc/meminfo")
@@ -341,37 +313,28 @@ MEMINFO = Path("/proc/meminfo")
 
 def free_memory() -> int:
     """Bytes that can be taken without swapping, as the system estimates them; where it does not, half of all memory."""
-    if MEMINFO.is_file():
-        for line in MEMINFO.read_text().splitlines():
-            name, _, value = line.partition(":")
-            if name == "MemAvailable":
-                return 1024 * int(value.split()[0])
+    with suppress(OSError):
+        return 1024 * _kib("MemAvailable", MEMINFO)
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
 
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-_NEVER_TRIM = (1 << 31) - 1
 
 
-def retain_freed_memory() -> bool:
-    """Makes this process reuse freed memory from now on; False if the C library does not support it (glibc does).
+def retain_freed_memory() -> None:
+    """Makes the process of a command reuse freed memory from now on, where the C library is glibc; it never shrinks
+    below its peak then.
 
     glibc returns every block above 32 MB to the system when it is freed, and threads other than the first get heaps
     that cannot grow beyond 64 MB. Each layer's activations are then new pages, which the system must clear: that costs
-    more than the arithmetic.
-
-    The process then never shrinks below its peak. Meant for commands, which have a process of their own. To be called
-    before the first network runs, since oneDNN reads the capacity of its cache of compiled products once; the default
-    of 1,024 is too small for the sizes that occur in a training.
+    more than the arithmetic. To be called before the first network runs, since oneDNN reads the capacity of its cache
+    of compiled products once; the default of 1,024 is too small for the sizes that occur in a training.
     """
     os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
-    try:
+    with suppress(OSError, AttributeError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError, TypeError):
-        return False
-    settings = ((_M_MMAP_THRESHOLD, 1 << 30), (_M_TRIM_THRESHOLD, _NEVER_TRIM), (_M_ARENA_MAX, 1))
-    accepted = [mallopt(name, value) for name, value in settings]
-    return accepted == [1, 1, 1]
+        for name, value in ((_M_MMAP_THRESHOLD, 1 << 30), (_M_TRIM_THRESHOLD, (1 << 31) - 1), (_M_ARENA_MAX, 1)):
+            mallopt(name, value)
 
 
 Device = Literal["auto", "cpu", "cuda"]

@@ -1,8 +1,4 @@
-"""Settings: options with their limits, knobs that trade cost for accuracy, and differences between settings.
-
-Stages list their knobs (`gsencoder.fusion.package`, `gsencoder.evaluate.tradeoff.stages`); a sweep needs no more than
-such a list.
-"""
+"""Settings: options with their limits, knobs that trade cost for accuracy, and differences between settings."""
 
 import operator
 import typing
@@ -27,8 +23,6 @@ def option(default: Any, help: str, **metadata: Any) -> Any:
     """A field of settings with its meaning and its limits, which `check_limits` checks.
 
     Args:
-        default: its default, of a type that cannot be changed.
-        help: its meaning, one line, which `gsencoder COMMAND --help` shows.
         metadata: limits `ge`, `gt`, `le`, `lt` of a number, or of each number of a tuple; `one`, what a tuple holds at
             most one of; and what the command line knows (`gsencoder.app.options`).
     """
@@ -43,20 +37,14 @@ def _words(cls: type) -> Mapping[str, tuple[Any, ...]]:
 
 
 def check_limits(settings: Any) -> None:
-    """Checks the values of a settings dataclass against the limits and words of its fields; None is within all limits.
-
-    Raises:
-        InputError: a value is outside; the field is named.
-    """
+    """Checks the values of a settings dataclass against the limits and words of its fields; None is within all."""
     for name, words in _words(type(settings)).items():  # type: ignore[arg-type]
         if (value := getattr(settings, name)) not in words:
             *others, last = map(str, words)
             raise InputError(f"{name}: expected {', '.join(others)}{' or ' if others else ''}{last}, got {value!r}")
     for item in fields(settings):
-        value, limits = (
-            getattr(settings, item.name),
-            {name: item.metadata[name] for name in LIMITS.keys() & item.metadata},
-        )
+        value = getattr(settings, item.name)
+        limits = {name: item.metadata[name] for name in LIMITS if name in item.metadata}
         if "one" in item.metadata and len(value) > 1:
             raise InputError(f"{item.name}: expected one {item.metadata['one']}, got {len(value)}")
         numbers = value if isinstance(value, tuple) else () if value is None else (value,)
@@ -64,16 +52,13 @@ def check_limits(settings: Any) -> None:
             isfinite(number) and all(LIMITS[name][0](number, limit) for name, limit in limits.items())
             for number in numbers
         ):
-            expected = " and ".join(LIMITS[name][1].format(f"{limits[name]:,}") for name in LIMITS if name in limits)
+            expected = " and ".join(LIMITS[name][1].format(f"{limit:,}") for name, limit in limits.items())
             expected = expected.replace(" or more and at most ", " to ")
-            raise InputError(
-                f"{item.name}: expected {expected}, got {list(value) if isinstance(value, tuple) else value}"
-            )
+            got = list(value) if isinstance(value, tuple) else value
+            raise InputError(f"{item.name}: expected {expected}, got {got}")
 
 
 Settings = TypeVar("Settings")
-
-SHOWN_DIGITS = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,12 +88,8 @@ def value_at(settings: object, key: str) -> Any:
 
 
 def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    """The settings with other values; those of one section change together, so that it checks them together.
-
-    Args:
-        settings: a frozen dataclass, sections of which are frozen dataclasses.
-        values: by key, with dots between sections.
-    """
+    """The settings with other values, by key with dots between sections; those of one section change together, so that
+    it checks them together."""
     assert is_dataclass(settings)
     assert not isinstance(settings, type)
     names = {item.name for item in fields(settings)}
@@ -154,7 +135,7 @@ def shown_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
-        return f"{value:.{SHOWN_DIGITS}g}"
+        return f"{value:.6g}"
     return str(value) if value not in ("", None) else "none"
 
 

@@ -43,11 +43,7 @@ class Kernel:
 
     @functools.cached_property
     def dispatcher(self) -> Callable[..., Any]:
-        """The compiled function, which is stored for later runs.
-
-        Warns:
-            SceneWarning: it cannot be stored; once a process.
-        """
+        """The compiled function, which is stored for later runs, or a warning says that it cannot be."""
         from numba import njit
 
         names = getattr(getattr(self._function, "__code__", None), "co_names", ())
@@ -87,8 +83,8 @@ def _warn_uncached() -> None:
 _here = threading.local()
 
 
-def _limit_threads(threads: int) -> None:
-    """Lets work on this thread have so many threads of its own."""
+def _limit_threads(threads: int | None) -> None:
+    """Sets the threads that work on this thread may have; None = `thread_count`."""
     _here.threads = threads
 
 
@@ -110,16 +106,13 @@ def available_cores() -> int:
 
 @contextlib.contextmanager
 def threads_of_torch(count: int) -> Iterator[None]:
-    """Lets torch and the kernels use so many threads within the block. torchrun starts each of several processes with
+    """Lets torch and the kernels use `count` threads within the block. torchrun starts each of several processes with
     one thread, which suits a training on GPUs and leaves most cores idle where a CPU computes."""
     import torch
 
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
+    with threads_unchanged():
+        torch.set_num_threads(count)
         yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager
@@ -137,13 +130,10 @@ def threads_unchanged() -> Iterator[None]:
 
 def parallel(work: Callable[[int], Result], pieces: Iterable[int]) -> list[Result]:
     """Runs `work` for each piece in `thread_count` threads, the caller's among them, and returns the results in order.
-    A nested call runs its pieces one after the other, since all threads are busy.
-
-    Raises:
-        BaseException: what `work` raised of the first piece that failed; pieces that no thread has begun are left out.
-    """
+    A nested call runs its pieces one after the other, since all threads are busy. The error of the first piece that
+    failed is raised; pieces that no thread has begun are left out."""
     waiting = list(pieces)
-    threads = min(getattr(_here, "threads", thread_count()), len(waiting))
+    threads = min(getattr(_here, "threads", None) or thread_count(), len(waiting))
     if threads <= 1:
         return [work(piece) for piece in waiting]
     results: dict[int, Result] = {}
@@ -191,10 +181,7 @@ def _one_thread() -> Iterator[None]:
     try:
         yield
     finally:
-        if before is None:
-            del _here.threads
-        else:
-            _limit_threads(before)
+        _limit_threads(before)
 
 
 def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1) -> Iterator[Result]:
