@@ -14,12 +14,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gsencoder import encode, load_scene, load_weights, localize
+from gsencoder import Encoder, load_scene, localize
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.infer.draw import contact_sheet, draw_boxes, fit_pca_colors, pca_picture
-from gsencoder.models.output_space import SHIPPED_WEIGHTS
 from gsencoder.render import blend
-from gsencoder.text.table import load_text_table
 
 
 def main() -> None:
@@ -34,10 +32,10 @@ def main() -> None:
     assert scene.gaussians is not None
     assert scene.views is not None
     assert scene.views.images is not None
-    encoder, outputs, _ = load_weights("house_cpu")
-    features = encode(scene.gaussians, encoder, outputs)
-    table = load_text_table(SHIPPED_WEIGHTS / "house_cpu" / "words.safetensors")
-    found = localize(replace(scene, features={features.space.name: features}), given.words.split(","), table)
+    encoder = Encoder.load("house_cpu")
+    features = encoder.encode(scene.gaussians)
+    assert encoder.words is not None
+    found = localize(replace(scene, features={features.space.name: features}), given.words.split(","), encoder.words)
 
     view, cameras = given.view, scene.views.cameras
     photograph = scene.views.images[view]

@@ -7,28 +7,30 @@ Sections that several commands have with the same options are written once, unde
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import yaml
 
-from gsencoder.app.compose import RULES, choice_help, choices_of, conf_folder
+from gsencoder.app.compose import RULES, choices_of, conf_folder
 from gsencoder.app.main import COMMANDS, FLAGS, SHORT, Command
 from gsencoder.app.options import (
     PRESET,
+    PRESETS,
     CommonConfig,
     Option,
     describe,
-    describe_presets,
     field_types,
     join_list,
     member_name,
     options_of,
+    preset_values,
     section_classes,
     union_members,
 )
+from gsencoder.core.settings import shown_value
 
 PAGE = Path(__file__).resolve().parents[1] / "cli.md"
 HEAD = """\
@@ -97,12 +99,12 @@ def escaped(text: str) -> str:
 def shown_default(option: Option) -> str:
     value = option.default
     if value is None or value == "" or value == () or value == {}:
-        return "required" if option.required else "none" if value is None else "empty"
+        return "required" if option.metadata.get("required") else "none" if value is None else "empty"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
     if isinstance(value, (list, tuple)):
         # Lists of numbers stand in brackets on the command line, lists of text do not.
-        text = join_list(map(str, value)) if option.kind == "list" else f"[{','.join(map(str, value))}]"
+        text = join_list(map(str, value)) if option.metadata.get("kind") == "list" else f"[{','.join(map(str, value))}]"
         return f"`{text}`"
     return f"`{value}`"
 
@@ -161,11 +163,11 @@ def anchor(section: Section) -> str:
 
 
 def presets(cls: type[CommonConfig]) -> list[str]:
-    changes = {name: text for name, text in describe_presets(cls).items() if "=" in text}
-    if not changes:
-        return []
-    named = "; ".join(f"`{PRESET}={name}` sets {escaped(text)}" for name, text in changes.items())
-    return [f"Presets: {named}.", ""]
+    sets = []
+    for name in PRESETS:
+        changes = ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, name).items())
+        sets += [f"`{PRESET}={name}` sets {escaped(changes)}"] if changes else []
+    return [f"Presets: {'; '.join(sets)}.", ""] if sets else []
 
 
 def command_text(name: str, command: Command, shared: set[Section]) -> list[str]:
@@ -189,7 +191,8 @@ def command_text(name: str, command: Command, shared: set[Section]) -> list[str]
     for group, members in choices.groups.items():
         if group != PRESET:
             names = ", ".join(f"`{member}`" for member in members)
-            meaning = f": {escaped(choice_help(cls, group))}" if choice_help(cls, group) else ""
+            help_ = next((str(each.metadata.get("help", "")) for each in fields(cls) if each.name == group), "")
+            meaning = f": {escaped(help_)}" if help_ else ""
             lines += [f"Choice `{group}=` of {names}; default `{choices.chosen[group]}`{meaning}.", ""]
     elsewhere = dict.fromkeys(
         (section.title if not section.member else f"`{section.name}.`", anchor(section))
