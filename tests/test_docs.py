@@ -344,4 +344,4 @@ def test_the_documents_are_looked_at() -> None:
     for contents, at_least in ((links_of, 20), (paths_of, 60), (dotted_names_of, 90), (command_lines_of, 30)):
         assert sum(len(contents(page)) for page in PAGES) >= at_least  # type: ignore[operator]
     assert sum(len(blocks_of(page, "python")) for page in PAGES) >= 4
-    assert {"fuse", "encode", "localize"} <= set(gsencoder.__all__)
+    assert {"fuse", "Encoder", "localize"} <= set(gsencoder.__all__)
