@@ -110,8 +110,6 @@ INDEX_FILE = "model.safetensors.index.json"
 UNREADABLE = (ImportError, OSError, ValueError, RuntimeError, KeyError, AttributeError, TypeError)
 """What transformers raises about a folder; an ImportError where the code of a model is in another library."""
 VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
-
-
 ANY = ("",)
 """Prefixes that all keys of weights have."""
 
@@ -126,10 +124,6 @@ def load_pretrained(loader: Any, folder: Path, subject: str, *, ignored: Sequenc
         ignored: prefixes of weights of modules that the class does not have, such as the other tower of a joint model,
             which need no warning.
         options: further arguments of `from_pretrained`.
-
-    Raises:
-        InputError: the folder holds no model of that class, or weights that do not fit its configuration or are not
-            finite.
     """
     weight_files(folder, subject)
     with _readable(folder, subject):
@@ -153,27 +147,42 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, subject: str)
             the part.
         subject: who loads it, for messages.
     """
-    files = weight_files(folder, subject)
+    files = weight_names(folder, subject)
+    prefixes = sorted(name.removesuffix(weight) for name in files if name.endswith(f".{weight}") or name == weight)
+    if len(prefixes) != 1:
+        raise InputError(f"{subject}: {folder}: {len(prefixes)} of its weights end in {weight}; expected one")
+    weights = read_weights(files, prefixes[0], folder, subject)
     with _readable(folder, subject):
         import torch
+
+        model, report = _from_pretrained(loader, None, config=config, state_dict=weights, dtype=torch.float32)
+    used = sorted({path for name, path in files.items() if name.startswith(prefixes[0])})
+    return _checked(folder, model, report, subject, ()), used
+
+
+def weight_names(folder: Path, subject: str) -> dict[str, Path]:
+    """The file of each weight of a folder, by the weight's name."""
+    files: dict[str, Path] = {}
+    for path in weight_files(folder, subject):
+        with _readable(folder, subject):
+            from safetensors import safe_open
+
+            with safe_open(path, framework="pt") as opened:
+                files |= dict.fromkeys(opened.keys(), path)
+    return files
+
+
+def read_weights(files: Mapping[str, Path], prefix: str, folder: Path, subject: str) -> dict[str, Any]:
+    """The tensors of `weight_names` whose names begin with a prefix, by the rest of their names."""
+    weights: dict[str, Any] = {}
+    with _readable(folder, subject):
         from safetensors import safe_open
 
-        names: dict[str, Path] = {}
-        for path in files:
+        for path in {path for name, path in files.items() if name.startswith(prefix)}:
             with safe_open(path, framework="pt") as opened:
-                names |= dict.fromkeys(opened.keys(), path)
-        prefixes = sorted(name.removesuffix(weight) for name in names if name.endswith(f".{weight}") or name == weight)
-        if len(prefixes) != 1:
-            raise InputError(f"{subject}: {folder}: {len(prefixes)} of its weights end in {weight}; expected one")
-        weights: dict[str, Any] = {}
-        used = sorted({path for name, path in names.items() if name.startswith(prefixes[0])})
-        for path in used:
-            with safe_open(path, framework="pt") as opened:
-                for name in opened.keys():  # noqa: SIM118 - it is no mapping
-                    if name.startswith(prefixes[0]):
-                        weights[name.removeprefix(prefixes[0])] = opened.get_tensor(name)
-        model, report = _from_pretrained(loader, None, config=config, state_dict=weights, dtype=torch.float32)
-    return _checked(folder, model, report, subject, ()), used
+                for name in (each for each, file in files.items() if file == path and each.startswith(prefix)):
+                    weights[name.removeprefix(prefix)] = opened.get_tensor(name)
+    return weights
 
 
 def weight_files(folder: Path, subject: str) -> list[Path]:
@@ -225,43 +234,34 @@ def _from_pretrained(loader: Any, source: str | None, **options: Any) -> tuple[A
 @contextmanager
 def _readable(folder: Path, subject: str) -> Iterator[None]:
     """Turns the errors of libraries that read a model into one that names its folder."""
-    try:
-        from safetensors import SafetensorError
-    except ImportError as error:
-        raise InputError(f"{subject}: needs the package transformers ({EXTRA})") from error
+    from safetensors import SafetensorError
+
     try:
         yield
     except InputError:
         raise
     except (*UNREADABLE, SafetensorError) as error:
+        if isinstance(error, ImportError) and error.name == "transformers":
+            raise InputError(f"{subject}: needs the package transformers ({EXTRA})") from error
         for path in folder.glob("*.safetensors"):
             check_fetched(path)
-        raise _unreadable(folder, subject, error) from error
+        message = " ".join(str(error).split())
+        if "custom code" in message or "trust_remote_code" in message:
+            raise InputError(
+                f"{subject}: {folder}: the model needs Python code of its own, which is never run; give a model of a "
+                "kind that transformers knows"
+            ) from error
+        raise InputError(f"{subject}: {folder} holds no model that transformers reads: {message[:160]}") from error
 
 
 def read_config(folder: Path, subject: str) -> Any:
     """The configuration of the model in a folder; InputError where transformers does not know the model without the
     folder's own code."""
     _check_files(folder)
-    try:
+    with _readable(folder, subject), quiet_transformers():
         from transformers import AutoConfig
-    except ImportError as error:
-        raise InputError(f"{subject}: needs the package transformers ({EXTRA})") from error
-    try:
-        with quiet_transformers():
-            return AutoConfig.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
-    except UNREADABLE as error:
-        raise _unreadable(folder, subject, error) from error
 
-
-def _unreadable(folder: Path, subject: str, error: Exception) -> InputError:
-    message = " ".join(str(error).split())
-    if "custom code" in message or "trust_remote_code" in message:
-        return InputError(
-            f"{subject}: {folder}: the model needs Python code of its own, which is never run; give a model of a kind "
-            "that transformers knows"
-        )
-    return InputError(f"{subject}: {folder} holds no model that transformers reads: {message[:160]}")
+        return AutoConfig.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
 
 
 def load_companion(loader: Any, folder: Path, subject: str, noun: str, **options: Any) -> Any:

@@ -52,15 +52,7 @@ class LabelsConfig(TeacherSettings):
         assert words is not None
         if isinstance(words, OpenVocabulary):
             words = words.including(sorted({o.name for o in scene.objects if o.name is not None}))
-        table = closed_table(words)
-        return LabelsTeacher(
-            scene.objects,
-            table.names,
-            table.embeddings,
-            text_encoder=table.space.text_encoder,
-            mean=table.mean,
-            cell=self.cell,
-        )
+        return LabelsTeacher(scene.objects, closed_table(words), cell=self.cell)
 
     def refuse_text(self) -> str:
         return ""
@@ -77,51 +69,33 @@ class LabelsTeacher:
     needs_images = False
     cheap = True
 
-    def __init__(
-        self,
-        objects: Sequence[SceneObject],
-        names: Sequence[str],
-        embeddings: Float32[np.ndarray, "C D"],
-        *,
-        text_encoder: str,
-        mean: Float32[np.ndarray, " D"] | None = None,
-        cell: int = 1,
-    ) -> None:
-        """Makes the scene's table; MissingInput without objects, InputError for a name that the table lacks.
-
-        Args:
-            objects: which instance value has which name.
-            names: the words of the table.
-            embeddings: their unit vectors.
-            text_encoder: what made these.
-            mean: of the text side, which "other" points along; None = that of the table.
-            cell: pixels along the side of a cell of the maps.
-        """
+    def __init__(self, objects: Sequence[SceneObject], words: TextTable, *, cell: int = 1) -> None:
+        """Makes the scene's table; MissingInput without objects, InputError for a name that `words` lacks."""
         if not objects:
             raise MissingInput(
                 "teacher labels: the scene lists no objects; it needs an objects.json in its folder, or the "
                 "label files of ScanNet or ScanNet++; teacher=mosaic text=minilm looks at pictures instead"
             )
-        row_of = {name: row for row, name in enumerate(names)}
+        text_encoder, row_of = words.space.text_encoder, {name: row for row, name in enumerate(words.names)}
         used = sorted({o.name for o in objects if o.name is not None})
         missing = [name for name in used if name not in row_of]
         if missing:
             raise InputError(
-                f"teacher labels: {len(missing)} object names are not among the {len(names)} words of {text_encoder}, "
+                f"teacher labels: {len(missing)} object names are not among the {len(words)} words of {text_encoder}, "
                 f"first {missing[0]!r}; change them or set them to null in objects.json, or give a table that has them "
                 "(teacher.words=)"
             )
-        mean = embeddings.mean(axis=0, dtype=np.float64) if mean is None else mean.astype(np.float64)
+        mean = words.mean.astype(np.float64)
         other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)
         self.kinds = tuple(used)
         self.names = ("other", *used)
-        self.vectors = np.stack([other, *(embeddings[row_of[name]] for name in used)]).astype(np.float32)
+        self.vectors = np.stack([other, *(words.embeddings[row_of[name]] for name in used)]).astype(np.float32)
         self.cell = cell
         self.table = self.vectors if cell == 1 else None
-        self.mean = mean.astype(np.float32)
+        self.mean = words.mean
         self.space = FeatureSpace(
             name=f"labels-{text_encoder}",
-            channels=embeddings.shape[1],
+            channels=words.space.channels,
             teacher="labels",
             preprocessing=f"mean of {cell}×{cell} pixels" if cell > 1 else "",
             text_encoder=text_encoder,

@@ -23,6 +23,7 @@ from gsencoder.core.device import choose_device, enough_memory
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import ANY, digest_files, find_file, load_companion, load_pretrained, read_config
 from gsencoder.core.process import Device
+from gsencoder.core.settings import option
 from gsencoder.data.readers.label_images import LABEL_SUFFIXES, label_files
 from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.pictures import photograph, read_preprocessing
@@ -30,33 +31,19 @@ from gsencoder.types import Scene, Views
 from gsencoder.types.orientation import turned
 
 WHAT = "teacher regions"
-ENDINGS = tuple(ending for suffix in LABEL_SUFFIXES for ending in (suffix, suffix.upper()))
-"""Of label images, as cameras and people write them."""
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 
 
 @runtime_checkable
 class RegionMasks(Protocol):
-    """Tells each pixel of a view which region it belongs to.
+    """The region of each pixel of a view, 0 = none; `settings` and `cheap` are those of `Teacher`."""
 
-    Attributes:
-        needs_images: whether it looks at photographs.
-        cheap: whether making masks twice costs less than keeping them.
-    """
+    needs_images: bool
+    cheap: bool
 
-    @property
-    def needs_images(self) -> bool: ...
+    def labels(self, views: Views, view: int) -> Int32[np.ndarray, "H W"]: ...
 
-    @property
-    def cheap(self) -> bool: ...
-
-    def labels(self, views: Views, view: int) -> Int32[np.ndarray, "H W"]:
-        """The number of each pixel's region, 0 = none."""
-        ...
-
-    def settings(self) -> dict[str, Any]:
-        """All but the views that the masks depend on, as JSON values."""
-        ...
+    def settings(self) -> dict[str, Any]: ...
 
 
 class InstanceMasks:
@@ -153,12 +140,8 @@ def label_paths(folder: Path, names: Sequence[str]) -> list[Path]:
     for name, stem in zip(names, stems, strict=True):
         bases = [folder / stem, folder / stem.name] if count[stem.name] == 1 else [folder / stem]
         # Not with_suffix, which would cut off the last part of "frame-000012.color".
-        candidates = [base.with_name(base.name + suffix) for base in bases for suffix in ENDINGS]
-        existing: list[Path] = []
-        for path in dict.fromkeys(candidates):
-            # A file system that ignores case has one file under both spellings of an ending.
-            if path.is_file() and not any(path.samefile(other) for other in existing):
-                existing.append(path)
+        candidates = [base.with_name(base.name + suffix) for base in bases for suffix in LABEL_SUFFIXES]
+        existing = [path for path in dict.fromkeys(candidates) if path.is_file()]
         if len(existing) > 1:
             raise InputError(
                 f"teacher.folder: view {name!r} has {len(existing)} label images, {existing[0]} and {existing[1]}; "
@@ -205,24 +188,21 @@ class Proposal:
         return slice(self.top, self.top + height), slice(self.left, self.left + width)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Input:
-    """A picture as the model takes it: its tensor, and the rows and columns of it that the picture fills."""
-
-    tensor: Any
-    rows: int
-    columns: int
+_Input = tuple[Any, int, int]
+"""A picture as the model takes it: its tensor, and the rows and columns of it that the picture fills."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SamOptions:
-    """Which masks of a SAM model stay; see `gsencoder.teachers.regions.RegionsConfig`."""
+    """Which masks of a SAM model stay."""
 
-    points: int = 32
-    min_iou: float = 0.88
-    min_stability: float = 0.95
-    max_overlap: float = 0.7
-    min_area: int = 64
+    points: int = option(32, "masks=sam: points a side of the grid that prompts it", ge=1, le=256)
+    min_iou: float = option(0.88, "masks=sam: smallest IoU that the model predicts of a mask", ge=0, le=1)
+    min_stability: float = option(0.95, "masks=sam: smallest IoU of a mask at logit thresholds of 1 and −1", ge=0, le=1)
+    max_overlap: float = option(0.7, "masks=sam: of two masks with a larger IoU the better one stays", ge=0, le=1)
+    min_area: int = option(
+        64, "vector=map and crop, and masks=sam: smallest number of pixels of a region in a view", ge=1, le=1 << 31
+    )
 
 
 class SamMasks:
@@ -231,7 +211,7 @@ class SamMasks:
     needs_images = True
     cheap = False
 
-    def __init__(self, model: str, options: SamOptions = SamOptions(), device: Device = "auto") -> None:
+    def __init__(self, model: str, options: SamOptions, device: Device = "auto") -> None:
         """Loads model and preprocessing; nothing is fetched from anywhere."""
         if not model:
             raise InputError("teacher.sam= is missing: the folder of a SAM model, for masks=sam")
@@ -281,10 +261,11 @@ class SamMasks:
 
     def _candidates(self, prepared: _Input) -> list[tuple[float, Any]]:
         """The masks whose predicted IoU is large enough, as that IoU and logits of the model's own resolution."""
-        points = grid_points(self.options.points) * np.array([prepared.columns, prepared.rows], np.float32)
+        tensor, rows, columns = prepared
+        points = grid_points(self.options.points) * np.array([columns, rows], np.float32)
         candidates: list[tuple[float, Any]] = []
         with torch.inference_mode(), enough_memory(WHAT, "teacher.points="):
-            embeddings = self._model.get_image_embeddings(prepared.tensor)
+            embeddings = self._model.get_image_embeddings(tensor)
             for start in range(0, len(points), POINTS_AT_ONCE):
                 chunk = torch.from_numpy(points[start : start + POINTS_AT_ONCE]).to(self._device)
                 outputs = self._model(
@@ -305,17 +286,18 @@ class SamMasks:
         if self._is_first:
             inputs = self._processor(images=Image.fromarray(image), return_tensors="pt")
             rows, columns = inputs["reshaped_input_sizes"][0].tolist()
-            return _Input(tensor=inputs["pixel_values"].to(self._device), rows=rows, columns=columns)
+            return inputs["pixel_values"].to(self._device), rows, columns
         side = self._side
         squeezed = np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR))
-        return _Input(tensor=self._colors.tensor(squeezed).to(self._device), rows=side, columns=side)
+        return self._colors.tensor(squeezed).to(self._device), side, side
 
     def _logits_of_picture(self, logits: Any, prepared: _Input, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
         """The logits of a mask at the resolution of the picture, without the padding of the input."""
         values = logits[None, None]
         if self._is_first:
-            values = interpolate(values, tuple(prepared.tensor.shape[-2:]), mode="bilinear", align_corners=False)
-            values = values[..., : prepared.rows, : prepared.columns]
+            tensor, rows, columns = prepared
+            values = interpolate(values, tuple(tensor.shape[-2:]), mode="bilinear", align_corners=False)
+            values = values[..., :rows, :columns]
         return np.asarray(interpolate(values, size, mode="bilinear", align_corners=False)[0, 0].cpu())
 
     def _proposal(self, logits: Float32[np.ndarray, "H W"], score: float) -> Proposal | None:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -123,10 +123,6 @@ class OnnxNetwork:
     """An .onnx file that takes one picture, [1, 3, H, W] or [1, H, W, 3], normalized or of bytes.
 
     Attributes:
-        name: of the file.
-        digest: of its content.
-        output: name of its output.
-        output_shape: as the file states it.
         fixed: rows and columns of the only pictures that it takes; None where it takes others.
         takes_bytes: whether pictures are not normalized.
         channels_first: whether it takes [1, 3, H, W].
@@ -182,10 +178,6 @@ class Preprocessing:
     """Resize with a filter, times a factor, minus a mean, divided by a standard deviation, for networks of torch.
 
     Attributes:
-        resample: filter of the resize.
-        factor: 8-bit values are multiplied by this.
-        mean: subtracted, one a channel.
-        std: divided by, one a channel.
         floats: whether values are resized after they were multiplied, and not rounded to 8 bits.
     """
 
@@ -283,28 +275,18 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
-class TorchNetwork(Protocol):
-    """A network that gives a vector for each patch of a picture with sides of whole patches.
-
-    Attributes:
-        patch: pixels along a patch.
-    """
-
-    patch: int
-
-    def __call__(self, pixels: Float[Tensor, "1 3 H W"]) -> Float[Tensor, "h w D"]: ...
-
-
 class TorchTeacher(PictureTeacher):
-    """A network of torch on whole pictures, which are resized to multiples of the patch, without a crop."""
+    """A network of torch on whole pictures, which are resized to multiples of its `patch`, without a crop."""
 
     preprocessing: Preprocessing
     size: int
     device: str
-    network: TorchNetwork
+    network: Any
 
     def map_of(self, pixels: Float[Tensor, "1 3 H W"]) -> Float[Tensor, "h w D"]:
-        return self.network(pixels)
+        """The vectors of the patches of a normalized picture."""
+        out: Tensor = self.network(pixels)
+        return out
 
     def cells(
         self, image: UInt8[np.ndarray, "H W 3"]

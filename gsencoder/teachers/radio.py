@@ -10,8 +10,7 @@ transformers loads the backbone alone. The heads lie in the same files, under `r
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +22,7 @@ from torch import Tensor, nn
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, about, listed
 from gsencoder.core.files import read_foreign_text
-from gsencoder.core.pretrained import check_fetched, digest_files, find_file, load_pretrained, read_config, weight_files
+from gsencoder.core.pretrained import digest_files, find_file, load_pretrained, read_config, read_weights, weight_names
 from gsencoder.core.process import Device
 from gsencoder.core.settings import option
 from gsencoder.teachers.base import Teacher, TeacherSettings, check_channels, text_encoder_of
@@ -158,15 +157,11 @@ def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[
         names: of heads: NAME, NAME.summary or NAME.features.
         channels: D of the backbone.
     """
-    files = weight_files(folder, WHAT)
+    files = weight_names(folder, WHAT)
     with about(f"heads of {folder}"):
         config = _read_config(folder)
-        heads: dict[str, Head] = {}
-        with _open_weights(files) as weights:
-            for name in names:
-                head = _read_head(weights, config, name, channels)
-                heads[head.name] = head
-        return list(heads.values())
+        heads = [_read_head(folder, files, config, name, channels) for name in names]
+    return list({head.name: head for head in heads}.values())
 
 
 def _read_config(folder: Path) -> dict[str, Any]:
@@ -179,32 +174,12 @@ def _read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-@contextmanager
-def _open_weights(paths: Sequence[Path]) -> Iterator[dict[str, Any]]:
-    """For each key of weights the open safetensors file that holds it."""
-    from safetensors import SafetensorError, safe_open
-
-    with ExitStack() as stack:
-        files: dict[str, Any] = {}
-        for path in paths:
-            check_fetched(path)
-            try:
-                file = stack.enter_context(safe_open(path, framework="pt"))
-            except (SafetensorError, OSError) as error:
-                raise InputError(f"{path.name}: no safetensors file: {' '.join(str(error).split())[:160]}") from error
-            for key in file.keys():  # noqa: SIM118 - not a mapping
-                if key in files:
-                    raise InputError(f"{key} is in two files; expected the files of one model")
-                files[key] = file
-        yield files
-
-
-def _read_head(weights: Mapping[str, Any], config: Mapping[str, Any], name: str, channels: int) -> Head:
+def _read_head(folder: Path, files: Mapping[str, Path], config: Mapping[str, Any], name: str, channels: int) -> Head:
     adapters: dict[str, Any] = config["adaptor_configs"]
     adapter, part = split_name(name, adapters)
     if adapter not in adapters:
         raise InputError(f"{name}: there is no such adapter; config.json has {listed(sorted(adapters)) or 'none'}")
-    if any(key.startswith(NORMALIZER) for key in weights):
+    if any(key.startswith(NORMALIZER) for key in files):
         raise InputError(
             f"{name}: the folder has a feature normalizer, which transformers does not apply; heads would be given "
             "other features than they were trained on"
@@ -224,7 +199,7 @@ def _read_head(weights: Mapping[str, Any], config: Mapping[str, Any], name: str,
                 f"takes {sizes['input_dim']} channels and the backbone has {channels}: a head of another backbone"
             )
         prefix = f"{ADAPTERS}{adapter}.{MODULES[part]}."
-        body = _read_body(weights, prefix, version, sizes)
+        body = _make_body(read_weights(files, prefix, folder, WHAT), prefix, version, sizes)
     return Head(name=full, body=body.requires_grad_(False).eval(), text=kind, model=str(teacher.get("model", "")))
 
 
@@ -269,13 +244,8 @@ def _sizes(adapter: Any, part: Part) -> dict[str, int]:
     return {name: int(value) for name, value in sizes.items() if value is not None}
 
 
-def _read_body(weights: Mapping[str, Any], prefix: str, version: str, sizes: Mapping[str, int]) -> nn.Sequential:
-    """Builds the layers of a head and reads their parameters: exactly those of its form."""
-    stored = {
-        key.removeprefix(prefix): tuple(file.get_slice(key).get_shape())
-        for key, file in weights.items()
-        if key.startswith(prefix)
-    }
+def _make_body(stored: Mapping[str, Tensor], prefix: str, version: str, sizes: Mapping[str, int]) -> nn.Sequential:
+    """The layers of a head with their parameters, which must be exactly those of its form."""
     if any("parametrizations" in key for key in stored):
         raise InputError(
             "its weights are in spectral reparametrization, which is not supported; expected plain ones (fc1.weight)"
@@ -284,30 +254,20 @@ def _read_body(weights: Mapping[str, Any], prefix: str, version: str, sizes: Map
         raise InputError(f"config.json states it, but no weights begin with {prefix}")
     body, modules = _build(version, sizes, pre_norm="pre_norm.0.weight" in stored)
     expected = {
-        f"{key}.{name}": tuple(value.shape)
-        for key, module in modules.items()
-        for name, value in module.named_parameters()
+        (f"{key}.{name}", value.shape) for key, module in modules.items() for name, value in module.named_parameters()
     }
-    for names, problem in (
-        (sorted(set(expected) - set(stored)), "missing"),
-        (sorted(set(stored) - set(expected)), f"not part of a head of form {version}"),
-    ):
-        if names:
-            keys = [f"{prefix}{name}" for name in names]
-            raise InputError(f"{len(names)} of its weights are {problem}: {listed(keys, 3)}")
-    for name, shape in expected.items():
-        if stored[name] != shape:
-            raise InputError(
-                f"{prefix}{name} is {list(stored[name])}, and config.json states {list(shape)}; expected both of one "
-                "model"
-            )
+    if wrong := expected ^ {(name, value.shape) for name, value in stored.items()}:
+        keys = sorted({f"{prefix}{name}" for name, _ in wrong})
+        raise InputError(
+            f"{len(keys)} of its weights are missing, too many, or of other shapes than config.json states for a head "
+            f"of form {version}: {listed(keys, 3)}"
+        )
+    for name, value in stored.items():
+        if not torch.isfinite(value).all():
+            raise InputError(f"{prefix}{name} has values that are not finite; fetch the file again")
     for key, module in modules.items():
-        for name, _ in list(module.named_parameters()):
-            full = f"{prefix}{key}.{name}"
-            value = weights[full].get_tensor(full).float()
-            if not torch.isfinite(value).all():
-                raise InputError(f"{full} has values that are not finite; fetch the file again")
-            setattr(module, name, nn.Parameter(value))
+        state = {name: stored[f"{key}.{name}"].float() for name, _ in module.named_parameters()}
+        module.load_state_dict(state, assign=True)
     return body
 
 

@@ -66,7 +66,7 @@ class OnnxRegionOptions(DenseOnnxOptions):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RegionsConfig(TeacherSettings):
+class RegionsConfig(TeacherSettings, SamOptions):
     """Where masks of regions come from, and what vector each region gets."""
 
     per_scene: ClassVar[bool] = True
@@ -112,14 +112,7 @@ class RegionsConfig(TeacherSettings):
     around: Literal["picture", "nothing"] = option(
         "picture", "vector=crop: what of the box is not in the region: the photograph as it is, or plain gray"
     )
-    min_area: int = option(
-        64, "vector=map and crop, and masks=sam: smallest number of pixels of a region in a view", ge=1, le=1 << 31
-    )
     sam: str = option("", "folder of a SAM model for transformers; also looked for in GSENCODER_MODELS")
-    points: int = option(32, "masks=sam: points a side of the grid that prompts it", ge=1, le=256)
-    min_iou: float = option(0.88, "masks=sam: smallest IoU that the model predicts of a mask", ge=0, le=1)
-    min_stability: float = option(0.95, "masks=sam: smallest IoU of a mask at logit thresholds of 1 and −1", ge=0, le=1)
-    max_overlap: float = option(0.7, "masks=sam: of two masks with a larger IoU the better one stays", ge=0, le=1)
     device: Device = option("auto", "where models of folders run")
     onnx: OnnxRegionOptions = field(default_factory=OnnxRegionOptions)
 
@@ -174,8 +167,7 @@ class RegionsConfig(TeacherSettings):
             return InstanceMasks(scene)
         if self.masks == "files":
             return FileMasks(scene, self.folder)
-        options = SamOptions(**{item.name: getattr(self, item.name) for item in fields(SamOptions)})
-        return SamMasks(self.sam, options, self.device)
+        return SamMasks(self.sam, self, self.device)
 
     def _captions(self, scene: Scene, views: Views, masks: RegionMasks) -> tuple[Captions, str]:
         """Captions, and where they are from."""
@@ -296,16 +288,7 @@ class CaptionedRegions:
         self, views: Views, masks: RegionMasks, captions: Captions, words: Words, *, rest: bool, source: str
     ) -> None:
         """Embeds the captions, and looks at the labels of all views once; warns of regions without a caption, and of
-        captions of labels that no view has.
-
-        Args:
-            views: of the scene.
-            masks: of regions.
-            captions: of their labels.
-            words: turns captions into vectors.
-            rest: whether the rest of a picture is something else; otherwise nothing is known of it.
-            source: of the captions, for messages.
-        """
+        captions of labels that no view has. `source` names the captions in messages."""
         self._masks, self._captions, self._rest, self._source = masks, captions, rest, source
         self.needs_images = masks.needs_images
         used = self._check_labels(views)
@@ -578,15 +561,8 @@ def square_crop(
 
 
 class OnnxImageTower:
-    """An .onnx file that gives a square picture one pooled vector, [1, D].
-
-    Attributes:
-        name: of the file.
-        digest: of its content.
-        channels: D.
-        preprocessing: in words.
-        gray: the color, 0 to 255, that means nothing to it.
-    """
+    """An .onnx file that gives a square picture one pooled vector, [1, D]; `gray` is the 8-bit color that means nothing
+    to it."""
 
     def __init__(self, path: Path, options: OnnxRegionOptions) -> None:
         """Reads the model's signature, and runs it once to see how many channels it gives."""

@@ -111,14 +111,7 @@ Scores = tuple[Float32[np.ndarray, "h w C"], bool, Float64[np.ndarray, "2 3"]]
 
 
 class OnnxSegmenter:
-    """An .onnx file that gives scores of classes on a grid.
-
-    Attributes:
-        name: of the file.
-        digest: of its content.
-        classes: the names in the .json of the same name; empty where there is none.
-        preprocessing: in words.
-    """
+    """An .onnx file that gives scores of classes on a grid; `classes` are the names in the .json of the same name."""
 
     def __init__(self, path: Path, options: OnnxSegmenterOptions) -> None:
         self._network = network = OnnxNetwork(path, options, WHAT)

@@ -18,7 +18,7 @@ from gsencoder.core.pretrained import (
     load_part,
     load_pretrained,
     read_config,
-    weight_files,
+    weight_names,
 )
 from gsencoder.core.process import Device
 from gsencoder.core.settings import option
@@ -257,15 +257,13 @@ class VisionTower(nn.Module):
         """Loads the tower in float32; nothing is fetched from anywhere.
 
         Args:
-            folder: of the model.
-            tower: its configuration.
+            folder, tower: of the model, and what its configuration says of the tower.
             dense: what the vectors are; auto = in the joint space if there is one: values of CLIP, summary of SigLIP.
             layer: tokens are hidden states of a layer, as transformers counts them: 0 = what goes into the first layer,
                 −1 = what comes from the last one, without the final norm. None = after the final norm.
         """
         super().__init__()
         self._kind, config = tower.kind, tower.config
-        files = weight_files(folder, WHAT)
         self._head = self._joint_head(folder, tower)
         self.dense = self._decide(dense, layer)
         self._layer = layer
@@ -285,6 +283,7 @@ class VisionTower(nn.Module):
             loader = getattr(transformers, self._kind.loader + projects)
             ignored = () if tower.alone else ANY
             self._model = load_pretrained(loader, folder, WHAT, ignored=ignored, config=config)
+            files = sorted(folder.glob("*.safetensors"))
         self.digest = digest_files(folder / "config.json", *files)
         self.patch = _side(config.patch_size)
         # SigLIP2 with pictures of any shape states a number of patches instead.
@@ -303,7 +302,7 @@ class VisionTower(nn.Module):
         if self._kind.joint == "head":
             return "head" if tower.config.vision_use_head else ""
         if self._kind.joint == "projection":
-            has = not tower.alone or "visual_projection.weight" in _names_of_weights(folder)
+            has = not tower.alone or "visual_projection.weight" in weight_names(folder, WHAT)
             return "projection" if has else ""
         return ""
 
@@ -379,19 +378,6 @@ def _side(value: Any) -> int:
     return int(value if isinstance(value, int) else value[0])
 
 
-def _names_of_weights(folder: Path) -> set[str]:
-    from safetensors import SafetensorError, safe_open
-
-    names: set[str] = set()
-    for path in weight_files(folder, WHAT):
-        try:
-            with safe_open(path, framework="pt") as opened:
-                names |= set(opened.keys())
-        except SafetensorError:
-            continue  # Loading it says what is wrong with it.
-    return names
-
-
 def window_starts(count: int, window: int, overlap: float) -> list[int]:
     """Where windows of `window` patches begin along a side of `count`: evenly apart, the first at 0 and the last one at
     the end; each covers again at least the share `overlap` of the one before."""
@@ -414,8 +400,7 @@ def map_in_windows(
     Args:
         network: gives a window's map, one cell a patch.
         pixels: a picture with sides of whole patches.
-        patch: pixels along a patch.
-        window: pixels along a window, in whole patches; a side of the picture that is shorter is one window.
+        patch, window: pixels along each; a side of the picture that is shorter than a window is one.
         overlap: smallest share of a window that the next one covers again, in [0, 1).
     """
     rows, columns = pixels.shape[2] // patch, pixels.shape[3] // patch

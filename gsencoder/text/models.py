@@ -55,15 +55,7 @@ class OnnxTextConfig:
 
 class OnnxTower:
     """A tokenizer and an ONNX graph. Phrases run one at a time and without padding: a graph with dynamic int8 scales
-    gives a phrase another vector in a batch, or with padding behind it.
-
-    Attributes:
-        name: of the folder.
-        identity: "onnx:" and a digest of graph, tokenizer and pooling.
-        channels: of its vectors.
-        pooling: of token vectors.
-        lower: never; its tokenizer does what its model needs.
-    """
+    gives a phrase another vector in a batch, or with padding behind it. Attributes are those of `TextTower`."""
 
     lower = False
 
@@ -186,12 +178,6 @@ class OnnxTower:
     def _probe(self) -> Float32[np.ndarray, " D"]:
         """The vector of the tokenizer's last token, which a graph with fewer rows in its embedding does not have."""
         last = self._tokenizer.get_vocab_size(with_added_tokens=True) - 1
-        vocab_size = _read_json(self._folder / "config.json").get("vocab_size")
-        if isinstance(vocab_size, int) and vocab_size <= last:
-            raise InputError(
-                f"{self._folder}: tokenizer.json has {last + 1} tokens and config.json says {vocab_size}; expected "
-                "both of one model"
-            )
         try:
             return self._pool(*self._run(np.array([last], np.int64)))
         except InputError as error:
@@ -309,16 +295,7 @@ class TransformersTextConfig:
 
 
 class TransformersTower:
-    """A text model of transformers with its tokenizer. Phrases run one at a time.
-
-    Attributes:
-        name: of the folder.
-        identity: "transformers:" and a digest of weights, configuration, tokenizer and reading.
-        pooling: of token vectors; "output" where the model has an output in the joint space.
-        channels: of its vectors.
-        model_type: kind of the model, as its configuration states it.
-        lower: whether phrases are lower-cased and lose their punctuation.
-    """
+    """A text model of transformers with its tokenizer. Phrases run singly. Attributes are those of `TextTower`."""
 
     def __init__(self, config: TransformersTextConfig) -> None:
         """Loads model and tokenizer; nothing is fetched from anywhere."""

@@ -6,23 +6,12 @@ from dataclasses import dataclass
 
 from gsencoder.text.table import TextTable
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WordRules:
-    """Words of a language that tell a name in a question from a verb or a color. Those of English were listed by hand.
-
-    Attributes:
-        pronouns: a name right after one of these is a verb, as in "do you watch".
-        auxiliaries: such a name right before a pronoun is a verb, as in "can you".
-        colors: such a name right before another name is its color, as in "the orange chair".
-    """
-
-    pronouns: frozenset[str] = frozenset({"i", "you", "we", "they", "he", "she", "one", "someone", "anyone"})
-    auxiliaries: frozenset[str] = frozenset({"can"})
-    colors: frozenset[str] = frozenset({"orange", "peach", "plum", "lime", "olive", "rose", "lavender", "chocolate"})
-
-
-ENGLISH = WordRules()
+PRONOUNS = frozenset({"i", "you", "we", "they", "he", "she", "one", "someone", "anyone"})
+"""A name right after one of these is a verb, as in "do you watch"."""
+AUXILIARIES = frozenset({"can"})
+"""Such a name right before a pronoun is a verb, as in "can you"."""
+COLORS = frozenset({"orange", "peach", "plum", "lime", "olive", "rose", "lavender", "chocolate"})
+"""Such a name right before another name is its color, as in "the orange chair"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,15 +24,10 @@ class _Token:
     joined: bool
 
 
-def words_in(text: str, table: TextTable, rules: WordRules = ENGLISH) -> tuple[str, ...]:
+def words_in(text: str, table: TextTable) -> tuple[str, ...]:
     """The names of a table that a text holds, in its order; of names within names the longest.
 
     Words of one name stand together: "table, lamp" holds no table lamp. A name may be in its singular or plural.
-
-    Args:
-        text: a question.
-        table: whose names are looked for.
-        rules: which words make a name a verb or a color.
     """
     text = unicodedata.normalize("NFKC", text)
     tokens = _tokens(text)
@@ -52,14 +36,12 @@ def words_in(text: str, table: TextTable, rules: WordRules = ENGLISH) -> tuple[s
     start = 0
     while start < len(tokens):
         row, length = _longest_name(text, tokens, start, longest, table)
-        if row is not None and not (length == 1 and _is_verb(tokens, start, rules)):
+        if row is not None and not (length == 1 and _is_verb(tokens, start)):
             matches.append((start, start + length, table.names[row]))
         start += length
     begins = {begin for begin, _, _ in matches}
     # A color belongs to the name after it.
-    names = [
-        name for _, end, name in matches if not (name.lower() in rules.colors and end in begins and tokens[end].joined)
-    ]
+    names = [name for _, end, name in matches if not (name.lower() in COLORS and end in begins and tokens[end].joined)]
     return tuple(dict.fromkeys(names))
 
 
@@ -79,10 +61,10 @@ def _longest_name(
     return None, 1
 
 
-def _is_verb(tokens: list[_Token], position: int, rules: WordRules) -> bool:
+def _is_verb(tokens: list[_Token], position: int) -> bool:
     before = tokens[position - 1].text.lower() if position and tokens[position].joined else ""
     after = tokens[position + 1].text.lower() if position + 1 < len(tokens) and tokens[position + 1].joined else ""
-    return before in rules.pronouns or (tokens[position].text.lower() in rules.auxiliaries and after in rules.pronouns)
+    return before in PRONOUNS or (tokens[position].text.lower() in AUXILIARIES and after in PRONOUNS)
 
 
 def _tokens(text: str) -> list[_Token]:

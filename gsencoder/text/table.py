@@ -57,15 +57,8 @@ class TextTower(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TowerRecord:
-    """Which tower made a table of names, as it is stored with the table.
-
-    Attributes:
-        kind: of tower.
-        name: of the folder that it was read from then.
-        identity, pooling: see `TextTower`.
-        templates: the sentences that each name was put into; their vectors were averaged.
-        lower: whether phrases are lower-cased and lose their punctuation before they are tokenized.
-    """
+    """Which tower made a table of names, as it is stored with the table; see `TextTower`. Each name was put into all
+    templates, whose vectors were averaged."""
 
     kind: str
     name: str
@@ -301,13 +294,10 @@ def unrounded(table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C D"]:
     return np.asarray(np.where(rounded, table / np.where(rounded, norms, 1), table))
 
 
-def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
+def load_text_table(path: str | Path) -> TextTable:
     """Reads an `.npz` with `names` and `embeddings`, or a `.safetensors` of `save_text_table`.
 
-    Args:
-        path: the file.
-        encoder: name of the text encoder. If empty, it is the entry `encoder` of the file, else the name of the file
-            without a trailing "_names".
+    The text encoder of an `.npz` is its entry `encoder`, else the name of the file without a trailing "_names".
     """
     file = Path(path)
     if not file.is_file():
@@ -315,18 +305,12 @@ def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
     with readable(file), open_foreign(file) as stream:
         zipped = stream.read(2) == b"PK"
     if zipped or file.suffix == ".npz":
-        return _read_npz(file, encoder)
+        return _read_npz(file)
     return _read_archive(file)
 
 
 def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float32", "float16"] = "float32") -> None:
-    """Writes the table as an archive of embeddings and mean, with the names and the space in its header.
-
-    Args:
-        path: the file.
-        table: to store.
-        dtype: of the embeddings; float16 halves the file.
-    """
+    """Writes the table as an archive of embeddings and mean, with the names and the space in its header."""
     space = {item.name: getattr(table.space, item.name) for item in fields(table.space)}
     arrays = {"embeddings": table.embeddings.astype(dtype), "mean": table.mean}
     header: dict[str, Any] = {"names": list(table.names), "space": space, "dtype": dtype}
@@ -346,10 +330,8 @@ def tower_from_json(values: Any) -> TowerRecord:
     """The record that JSON values hold."""
     if not isinstance(values, dict) or values.keys() != {item.name for item in fields(TowerRecord)}:
         raise InputError(f"expected the record of a text tower, got {str(values)[:60]!r}")
-    if not isinstance(values["templates"], list):
-        raise InputError("expected a list of templates in the record of a text tower")
-    if not isinstance(values["lower"], bool):
-        raise InputError("expected true or false as lower in the record of a text tower")
+    if not isinstance(values["templates"], list) or not isinstance(values["lower"], bool):
+        raise InputError("expected a list of templates, and true or false as lower, in the record of a text tower")
     return TowerRecord(**{**values, "templates": tuple(values["templates"])})
 
 
@@ -380,10 +362,10 @@ def _read_archive(file: Path) -> TextTable:
         )
 
 
-def _read_npz(file: Path, encoder: str) -> TextTable:
+def _read_npz(file: Path) -> TextTable:
     expected = {"names": ("U", 1), "embeddings": ("f", 2)}
     arrays = read_npz(file, expected, {"encoder": ("U", 0)}, max_text=MAX_NAME)
-    made_by = encoder or str(arrays.get("encoder", "")) or file.stem.removesuffix("_names")
+    made_by = str(arrays.get("encoder", "")) or file.stem.removesuffix("_names")
     try:
         return make_text_table([str(name) for name in arrays["names"]], arrays["embeddings"], made_by)
     except InputError as error:
@@ -392,18 +374,17 @@ def _read_npz(file: Path, encoder: str) -> TextTable:
 
 @runtime_checkable
 class TextEncoder(Protocol):
-    """Encodes words as vectors of a feature space.
-
-    Attributes:
-        space: the feature space; its `text_encoder` is the name of this encoder.
-        mean: the mean of text vectors, which centered cosines subtract from words.
-    """
+    """Encodes words as vectors of a feature space: a table, or an `OpenVocabulary`."""
 
     @property
-    def space(self) -> FeatureSpace: ...
+    def space(self) -> FeatureSpace:
+        """Its `text_encoder` is the name of this encoder."""
+        ...
 
     @property
-    def mean(self) -> Float32[np.ndarray, " D"]: ...
+    def mean(self) -> Float32[np.ndarray, " D"]:
+        """The mean of text vectors, which centered cosines subtract from words."""
+        ...
 
     def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
         """A unit vector for each word; InputError for an unknown word."""
@@ -448,15 +429,10 @@ def cached_vectors(
     phrases: Sequence[str],
     compute: Callable[[list[str]], Float32[np.ndarray, "missing D"]],
 ) -> Float32[np.ndarray, "Q D"]:
-    """The vectors of phrases, from the cache where it has them.
-
-    Args:
-        identity: of the tower.
-        templates: sentences that phrases are put into.
-        phrases: to be embedded.
-        compute: embeds phrases that the cache does not have.
-    """
-    path = _file_of(identity, templates)
+    """The vectors of phrases, from the cache of a tower and its templates; `compute` embeds those that it lacks."""
+    folder = cache_folder()
+    digest = hashlib.sha256(repr((identity, tuple(templates))).encode("utf-8", "backslashreplace")).hexdigest()
+    path = None if folder is None else folder / f"{digest[:24]}.safetensors"
     cached = _read(path) if path is not None else {}
     missing = list(dict.fromkeys(phrase for phrase in phrases if phrase not in cached))
     if missing:
@@ -465,14 +441,6 @@ def cached_vectors(
             _write(path, computed if len(cached) + len(computed) > MAX_PHRASES else cached | computed)
         cached = cached | computed
     return np.stack([cached[phrase] for phrase in phrases])
-
-
-def _file_of(identity: str, templates: Sequence[str]) -> Path | None:
-    folder = cache_folder()
-    if folder is None:
-        return None
-    digest = hashlib.sha256(repr((identity, tuple(templates))).encode("utf-8", "backslashreplace")).hexdigest()
-    return folder / f"{digest[:24]}.safetensors"
 
 
 def _read(path: Path) -> dict[str, Float32[np.ndarray, " D"]]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsencoder.text.question_words import WordRules, words_in
+from gsencoder.text.question_words import words_in
 from gsencoder.text.table import make_text_table
 
 
@@ -45,10 +45,3 @@ def test_words_that_only_look_like_names_are_not_looked_for() -> None:
         ("\u0915\u0941\u0930\u094d\u0938\u0940 ?", ("\u0915\u0941\u0930\u094d\u0938\u0940",)),
     ):
         assert words_in(text, table) == words, text
-
-
-def test_questions_in_another_language_have_its_words() -> None:
-    table = make_text_table(["Stuhl", "Flieder"], np.eye(2, dtype=np.float32), "t")
-    german = WordRules(pronouns=frozenset({"ich", "du"}), auxiliaries=frozenset(), colors=frozenset({"flieder"}))
-    assert words_in("Wo steht der Flieder Stuhl?", table) == ("Flieder", "Stuhl")
-    assert words_in("Wo steht der Flieder Stuhl?", table, german) == ("Stuhl",)

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from field_scenes import FieldRoom
 from onnx import TensorProto, helper
 from text_towers import save_graph, save_tokenizer
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.compose import compose
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.scenes import load_scene
+from gsencoder.data.synthetic import make_room
 from gsencoder.teachers.build import (
     SEGMENTER,
     SENTENCES,
@@ -40,8 +39,8 @@ OTHER = OnnxTextConfig(model="other")
 
 
 @pytest.fixture(scope="module")
-def room(field_room: FieldRoom) -> Scene:
-    return load_scene(field_room.room)
+def room() -> Scene:
+    return make_room(views=1, width=32, height=24, objects=4)
 
 
 def installed(teacher: TeacherConfig, text: TextConfig) -> Words | None:
@@ -75,7 +74,6 @@ def test_labels_are_taken_where_a_scene_has_some(room: Scene) -> None:
 
 
 def test_a_segmenter_is_taken_where_a_scene_has_no_labels(room: Scene) -> None:
-    assert room.views is not None
     no_maps = replace(room, views=replace(room.views, instances=None))
     for scene in (replace(room, objects=()), no_maps, renamed(room, None), renamed(room, "thing_17", None)):
         taken = chosen(scene)

@@ -49,10 +49,7 @@ def test_crops_through_an_onnx_tower_are_its_pooled_output(tmp_path: Path, aroun
         onnx=OnnxRegionOptions(size=16, **PLAIN),
     )
     scene = region_scene()
-    assert scene.views is not None
-    assert scene.views.images is not None
     table = made(teacher, 1).table
-    assert table is not None
     for row, label in enumerate((1, 7)):
         square = square_crop(scene.views.images[1], labels_of(1) == label, (0, 0, 0), masked=around == "nothing")
         mean = np.asarray(Image.fromarray(square).resize((16, 16), Image.Resampling.BICUBIC)).mean(axis=(0, 1))
@@ -95,8 +92,6 @@ def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_librar
     teacher = build(masks, tmp_path / "model", "crop", words, min_area=1, joint=not joint, device="cpu")
     assert teacher.space.text_encoder == "toy"
     scene = region_scene()
-    assert scene.views is not None
-    assert scene.views.images is not None
     gray = tuple(round(255 * value) for value in processor.image_mean)
     square = square_crop(scene.views.images[0], labels_of(0) == 7, gray, masked=False)
     inputs = processor(images=Image.fromarray(square), return_tensors="pt")
@@ -104,7 +99,6 @@ def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_librar
         outputs = model.get_image_features(**inputs) if joint else model(**inputs)
     vector = outputs.pooler_output[0].numpy()
     table = made(teacher, 0).table
-    assert table is not None
     np.testing.assert_allclose(table[1], vector / np.linalg.norm(vector), atol=1e-5)
     with pytest.raises(InputError, match="channels and its words 5"):
         build(masks, tmp_path / "model", "crop", toy_words("mug", channels=5), joint=True, device="cpu")

@@ -43,7 +43,6 @@ def test_each_region_has_the_mean_of_the_dense_teachers_map(tmp_path: Path) -> N
     model = save_colors(tmp_path / "net.onnx")
     teacher = build(write_masks(tmp_path / "m"), model, "map", min_area=1)
     scene = region_scene()
-    assert scene.views is not None
     dense = OnnxTeacher(OnnxConfig(model=str(model), layout="grid", patch=4, size=WIDTH, **PLAIN))
     for view in range(2):
         one, regions = made(teacher, view), np.unique(labels_of(view))[1:]
@@ -63,12 +62,9 @@ def test_small_regions_have_no_vector_and_are_counted(tmp_path: Path) -> None:
     with pytest.warns(SceneWarning, match="1 of 5 regions in 2 views have less than 20 pixels and no feature"):
         teacher = build(masks, model, "map", min_area=20)
     one = made(teacher, 0)
-    assert one.codes is not None
-    assert one.table is not None
     assert (one.codes[labels_of(0) == 9] == -1).all()
     assert len(one.table) == 2
     exact = made(build(masks, model, "map", min_area=12), 0)
-    assert exact.table is not None
     assert len(exact.table) == 3
     with pytest.raises(InputError, match="all 5 regions in 2 views have less than 5000 pixels"):
         build(masks, model, "map", min_area=5000)
@@ -92,13 +88,11 @@ def test_vectors_that_are_not_finite_are_refused_with_view_and_label(tmp_path: P
     class NanTeacher(OnnxTeacher):
         def feature_map(self, views: Any, view: int) -> FeatureMap:
             dense = super().feature_map(views, view)
-            assert dense.features is not None
             dense.features[0, -1] = np.nan
             return dense
 
     options = OnnxConfig(model=str(save_colors(tmp_path / "c.onnx")), layout="grid", patch=4, size=WIDTH, **PLAIN)
     scene = region_scene()
-    assert scene.views is not None
     with pytest.raises(InputError, match="view 'images/a.jpg': 1 of 2 regions have no finite vector, first label 9;"):
         MapVectors(NanTeacher(options)).vectors(scene.views, 0, labels_of(0).astype(np.int32), [1, 9])
 

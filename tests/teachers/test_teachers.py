@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from onnx import helper, numpy_helper
+from region_scenes import save_colors, save_net
 from splats import front_camera
 
 from gsencoder.core.errors import InputError
-from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import (
     _PROTOTYPES,
     COLOR_NAMES,
@@ -24,7 +25,6 @@ from gsencoder.types import Scene, SceneObject, Views
 
 def views_of(image: np.ndarray | None = None, instances: np.ndarray | None = None) -> Views:
     array = image if image is not None else instances
-    assert array is not None
     cameras = front_camera(array.shape[1], array.shape[0])
     return Views(
         cameras=cameras,
@@ -46,7 +46,6 @@ def test_the_palette_calls_css_colors_by_their_names(rgb: tuple[int, int, int], 
     image = np.broadcast_to(np.array(rgb, np.uint8), (6, 8, 3)).copy()
     teacher = PaletteTeacher()
     features = teacher.feature_map(views_of(image), 0).features
-    assert features is not None
     assert features.shape == (3, 4, 11)
     assert COLOR_NAMES[int(features[0, 0].argmax())] == name
     np.testing.assert_allclose(features.sum(axis=-1), 1, rtol=1e-5)
@@ -81,10 +80,9 @@ def label_objects() -> tuple[SceneObject, ...]:
 
 def test_labels_give_each_pixel_its_name_and_the_rest_the_mean_direction() -> None:
     embeddings = np.eye(4, 8, dtype=np.float32)
-    teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, text_encoder="t")
+    teacher = LabelsTeacher(label_objects(), make_text_table(("ball", "cup", "mug", "pen"), embeddings, "t"))
     instances = np.array([[0, 3, 5], [9, 9, 77]], np.int32)
     feature_map = teacher.feature_map(views_of(instances=instances), 0)
-    assert feature_map.codes is not None
     vectors = teacher.table[feature_map.codes]
     np.testing.assert_allclose(vectors[0, 1], embeddings[2])
     np.testing.assert_allclose(vectors[1, 0], embeddings[0])
@@ -94,40 +92,27 @@ def test_labels_give_each_pixel_its_name_and_the_rest_the_mean_direction() -> No
 
 
 def test_labels_without_objects_names_or_maps_say_so() -> None:
-    embeddings = np.eye(4, 8, dtype=np.float32)
+    words = make_text_table(("ball", "mug"), np.eye(2, 8), "t")
     with pytest.raises(InputError, match="lists no objects"):
-        LabelsTeacher((), ("a",), embeddings[:1], text_encoder="t")
+        LabelsTeacher((), words)
     with pytest.raises(InputError, match="not among the 2 words of t, first 'mug'"):
-        LabelsTeacher(label_objects(), ("ball", "cup"), embeddings[:2], text_encoder="t")
-    teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, text_encoder="t")
+        LabelsTeacher(label_objects(), make_text_table(("ball", "cup"), np.eye(2, 8), "t"))
+    teacher = LabelsTeacher(label_objects(), words)
     with pytest.raises(InputError, match="no instance maps"):
         teacher.feature_map(views_of(np.zeros((4, 4, 3), np.uint8)), 0)
 
 
 def write_mean_model(path: Path, patch: int = 4) -> None:
     """A backbone whose features are each patch's mean color, as tokens after one CLS token of zeros."""
-    onnx = pytest.importorskip("onnx")
-    helper, numpy_helper = onnx.helper, onnx.numpy_helper
-    F = onnx.TensorProto.FLOAT
-    nodes = [
+    constants = {"flat": np.array([1, 3, -1]), "cls": np.zeros((1, 1, 3), np.float32)}
+    save_net(
+        path,
+        *(helper.make_node("Constant", [], [name], value=numpy_helper.from_array(v)) for name, v in constants.items()),
         helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[patch, patch], strides=[patch, patch]),
         helper.make_node("Reshape", ["pooled", "flat"], ["grid"]),
         helper.make_node("Transpose", ["grid"], ["tokens"], perm=[0, 2, 1]),
         helper.make_node("Concat", ["cls", "tokens"], ["out"], axis=1),
-    ]
-    constants = [
-        numpy_helper.from_array(np.array([1, 3, -1], np.int64), "flat"),
-        numpy_helper.from_array(np.zeros((1, 1, 3), np.float32), "cls"),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "mean",
-        [helper.make_tensor_value_info("image", F, [1, 3, "H", "W"])],
-        [helper.make_tensor_value_info("out", F, [1, "T", 3])],
-        constants,
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    onnx.save(model, path)
 
 
 def onnx_config(path: Path, **options: object) -> OnnxConfig:
@@ -148,7 +133,6 @@ def test_an_onnx_backbone_sees_each_patch_where_it_is(tmp_path: Path) -> None:
     image = np.zeros((24, 32, 3), np.uint8)
     image[8:12, 20:24, 1] = 255
     feature_map = teacher.feature_map(views_of(image), 0)
-    assert feature_map.features is not None
     assert feature_map.features.shape == (6, 8, 3)
     assert teacher.space.channels == 3
     row, column = np.unravel_index(feature_map.features[..., 1].argmax(), (6, 8))
@@ -166,7 +150,6 @@ def test_a_classifier_becomes_a_mixture_of_the_known_classes_words(tmp_path: Pat
     image[..., 1] = 200
     image[..., 2] = 255
     features = teacher.feature_map(views_of(image), 0).features
-    assert features is not None
     odds = np.exp(200 / 255)
     np.testing.assert_allclose(features[0, 0], np.array([1, odds, 0, 0, 0]) / np.hypot(1, odds), atol=1e-6)
 
@@ -178,6 +161,9 @@ def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no model that onnxruntime reads"):
         OnnxTeacher(onnx_config(tmp_path / "bad.onnx"))
     write_mean_model(tmp_path / "m.onnx")
+    (tmp_path / "classes.npz").write_bytes(b"PK\3\4 and no more")
+    with pytest.raises(InputError, match=r"classes\.npz: cannot be read as \.npz"):
+        OnnxTeacher(onnx_config(tmp_path / "m.onnx", classes=str(tmp_path / "classes.npz")))
     with pytest.raises(InputError, match="has outputs"):
         OnnxTeacher(onnx_config(tmp_path / "m.onnx", output="nope"))
     teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx", skip_tokens=0))
@@ -192,7 +178,6 @@ def test_real_backbones_give_finite_features_of_their_stated_width(shared: Path)
         OnnxConfig(model=str(shared / "models/dinov2_s14_dense_int8.onnx"), patch=14, size=112, skip_tokens=1)
     )
     features = dino.feature_map(views_of(image), 0).features
-    assert features is not None
     assert features.shape == (8, 8, 384)
     assert np.isfinite(features).all()
 
@@ -200,13 +185,11 @@ def test_real_backbones_give_finite_features_of_their_stated_width(shared: Path)
 def test_labels_on_cells_are_the_means_of_their_pixels() -> None:
     rng = np.random.default_rng(0)
     instances = rng.choice(np.array([0, 3, 9]), (7, 10)).astype(np.int32)
-    table = np.eye(4, dtype=np.float32)
-    names = ("mug", "ball", "cup", "fork")
-    fine = LabelsTeacher(label_objects(), names, table, text_encoder="t").feature_map(views_of(instances=instances), 0)
-    teacher = LabelsTeacher(label_objects(), names, table, text_encoder="t", cell=3)
+    words = make_text_table(("mug", "ball", "cup", "fork"), np.eye(4), "t")
+    scene = Scene(name="s", objects=label_objects())
+    fine = LabelsConfig().build(scene, words).feature_map(views_of(instances=instances), 0)
+    teacher = LabelsConfig(cell=3).build(scene, words)
     coarse = teacher.feature_map(views_of(instances=instances), 0)
-    assert fine.table is not None
-    assert fine.codes is not None
     pixels = fine.table[fine.codes][:6, :9].reshape(2, 3, 3, 3, 4)
     np.testing.assert_allclose(coarse.features, pixels.mean(axis=(1, 3)), atol=1e-6)
     assert coarse.grid_from_image[0, 0] == pytest.approx(1 / 3)
@@ -214,69 +197,27 @@ def test_labels_on_cells_are_the_means_of_their_pixels() -> None:
         teacher.feature_map(views_of(instances=instances[:2]), 0)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("patch", 0), ("patch", -14), ("size", 0), ("size", 10**9), ("skip_tokens", -1), ("scale", 0.0),
-        ("scale", float("nan")), ("temperature", 0.0), ("temperature", -1.0),
-        ("mean", (0.0, 0.0, float("nan"))), ("std", (1.0, 0.0, 1.0)),
-    ],
-)  # fmt: skip
-def test_settings_that_no_backbone_can_have_are_refused_by_name(name: str, value: object) -> None:
-    with pytest.raises(InputError, match=f"^{name}: expected"):
-        onnx_config(Path("m.onnx"), **{name: value})
-
-
-def write_pooling_model(path: Path, factor: float, inputs: tuple[int | str, ...], outputs: tuple[str, ...]) -> None:
-    """A grid backbone: each patch's mean color times `factor`."""
-    onnx = pytest.importorskip("onnx")
-    helper, F = onnx.helper, onnx.TensorProto.FLOAT
-    nodes = [
-        helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[4, 4], strides=[4, 4]),
-        helper.make_node("Mul", ["pooled", "factor"], ["out"]),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "pool",
-        [helper.make_tensor_value_info("image", F, list(inputs))],
-        [helper.make_tensor_value_info("out", F, list(outputs))],
-        [onnx.numpy_helper.from_array(np.array(factor, np.float32), "factor")],
-    )
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), path)
-
-
 def test_values_that_are_not_finite_are_told_with_model_and_view(tmp_path: Path) -> None:
-    write_pooling_model(tmp_path / "m.onnx", float("nan"), (1, 3, "H", "W"), ("B", "D", "h", "w"))
+    save_net(
+        tmp_path / "m.onnx",
+        helper.make_node("AveragePool", ["image"], ["cells"], kernel_shape=[4, 4], strides=[4, 4]),
+        helper.make_node("Sub", ["cells", "cells"], ["zero"]),
+        helper.make_node("Div", ["zero", "zero"], ["out"]),
+    )
     teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx", layout="grid"))
     with pytest.raises(InputError, match=r"m\.onnx: view 'a': 144 of 144 values are not finite"):
         teacher.feature_map(views_of(np.ones((24, 32, 3), np.uint8)), 0)
 
 
 def test_a_model_that_cannot_take_a_picture_is_told_with_the_pictures_size(tmp_path: Path) -> None:
-    write_pooling_model(tmp_path / "m.onnx", 1.0, (1, 3, 99, 99), ("B", "D", "h", "w"))
+    weight = helper.make_node("Constant", [], ["w"], value=numpy_helper.from_array(np.ones((1, 3, 99, 99), np.float32)))
+    save_net(tmp_path / "m.onnx", weight, helper.make_node("Conv", ["image", "w"], ["out"]))
     teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx", layout="grid"))
     with pytest.raises(InputError, match=r"m\.onnx does not run on a picture \[1, 3, 24, 32\]"):
         teacher.feature_map(views_of(np.ones((24, 32, 3), np.uint8)), 0)
 
 
 def test_an_output_with_other_axes_than_the_layouts_is_refused(tmp_path: Path) -> None:
-    write_pooling_model(tmp_path / "m.onnx", 1.0, (1, 3, "H", "W"), ("B", "D", "h", "w"))
+    save_colors(tmp_path / "m.onnx")
     with pytest.raises(InputError, match=r"of shape \[1, 3, 2, 2\], expected \[1, tokens, channels\]"):
         OnnxTeacher(onnx_config(tmp_path / "m.onnx", layout="tokens"))
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\3\4 and no more", b"\x93NUMPY"])
-def test_class_vectors_from_a_damaged_file_are_refused(tmp_path: Path, content: bytes) -> None:
-    write_mean_model(tmp_path / "m.onnx")
-    (tmp_path / "classes.npz").write_bytes(content)
-    with pytest.raises(InputError, match=r"classes\.npz: cannot be read as \.npz"):
-        OnnxTeacher(onnx_config(tmp_path / "m.onnx", classes=str(tmp_path / "classes.npz")))
-
-
-def test_labels_are_built_with_the_cells_that_are_asked_for() -> None:
-    words = make_text_table(("mug", "cup"), np.eye(2, dtype=np.float32), "w")
-    labeled = Scene(name="s", objects=(SceneObject(id=1, name="mug", aabb_min=np.zeros(3), aabb_max=np.ones(3)),))
-    for cell in (1, 3):
-        teacher = build_teacher(LabelsConfig(cell=cell), labeled, words)
-        assert isinstance(teacher, LabelsTeacher)
-        assert (teacher.cell, teacher.table is None) == (cell, cell > 1)

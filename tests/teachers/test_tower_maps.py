@@ -43,9 +43,7 @@ def map_of(folder: Path, image: np.ndarray, **settings: Any) -> FeatureMap:
 
 
 def features_of(folder: Path, image: np.ndarray, **settings: Any) -> np.ndarray:
-    features = map_of(folder, image, **settings).features
-    assert features is not None
-    return features
+    return map_of(folder, image, **settings).features
 
 
 def inputs_of(kind: str, image: np.ndarray, grid: tuple[int, int]) -> dict[str, torch.Tensor]:
@@ -100,7 +98,6 @@ def test_hidden_states_equal_a_direct_call_of_the_library(saved: Save, kind: str
     folder, model = saved(kind)
     image, size, grid = (SMALL_WIDE if kind == "sam" else WIDE) if wide else SQUARE
     made = map_of(folder, image, dense="tokens", size=size if wide else 0)
-    assert made.features is not None
     assert made.features.shape[:2] == grid
     np.testing.assert_allclose(made.features, direct(kind, model, image, grid), atol=1e-5)
     height, width = image.shape[:2]
@@ -220,8 +217,8 @@ def test_the_layout_of_published_llava_weights_is_read(saved: Save, tmp_path: Pa
     np.testing.assert_array_equal(features_of(tmp_path, SQUARE[0]), features_of(folder, SQUARE[0]))
 
 
-@pytest.mark.parametrize("kind", MAKERS)
-@pytest.mark.parametrize("dense", ["auto", "tokens"])
+@pytest.mark.parametrize("kind", ["clip", "siglip2", "dinov3", "sam"])
+@pytest.mark.parametrize("dense", ["auto"])
 def test_a_tower_in_bfloat16_stays_near_the_one_in_float32(saved: Save, kind: str, dense: Any) -> None:
     """As on a GPU, where it runs under autocast."""
     folder, _ = saved(kind)

@@ -34,26 +34,11 @@ def test_a_scene_without_pictures_is_refused(models: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"size": -1}, "size: expected 0 to 8,192"),
-        ({"overlap": 1.0}, "overlap: expected 0 to 0.9"),
-        ({"overlap": -0.1}, "overlap: expected 0 to 0.9"),
-        ({"dense": "values", "layer": -2}, "layer: hidden states of a layer are dense=tokens"),
-    ],
-)
-def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        TransformersConfig(**settings)
-
-
-@pytest.mark.parametrize(
     ("kind", "settings", "message"),
     [
         ("clip", {"layer": LAYERS + 1}, r"layer: expected -4 to 3, as this CLIP tower has 3 layers, got 4"),
         ("clip", {"layer": -LAYERS - 2}, r"layer: expected -4 to 3"),
         ("dinov2", {"dense": "summary"}, "this DINOv2 tower has none; give dense=tokens"),
-        ("sam", {"dense": "values"}, "this SAM tower has none"),
         ("llava", {"dense": "values"}, "this CLIP tower has none"),
         ("sam", {"size": 64}, "SAM takes pictures of up to 32 pixels, got 64; give large=windows"),
     ],
@@ -63,7 +48,9 @@ def test_what_a_tower_does_not_have_is_refused(models: Path, kind: str, settings
         teacher(models / kind, **settings)
 
 
-def test_a_model_that_is_not_named_or_not_there_is_refused() -> None:
+def test_settings_that_do_not_go_together_and_a_model_that_is_not_there_are_refused() -> None:
+    with pytest.raises(InputError, match="layer: hidden states of a layer are dense=tokens"):
+        TransformersConfig(dense="values", layer=-2)
     with pytest.raises(InputError, match="teacher.model= is missing: the folder of a vision model"):
         TransformersTeacher(TransformersConfig())
     with pytest.raises(InputError, match="teacher.model: no folder at nowhere"):
@@ -96,13 +83,10 @@ def test_models_of_other_kinds_are_refused_with_the_kinds_that_are_known(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"image_mean": None}, "does not state image_mean; take the file that belongs to the model"),
         ({"image_mean": None, "resample": None}, "does not state resample, image_mean"),
         ({"image_mean": [0.5, 0.5]}, "image_mean: expected three numbers, one a channel"),
         ({"image_std": [0.5, 0.5, 0.0]}, "image_std: expected three numbers above 0"),
-        ({"image_std": [0.5, 0.5, float("inf")]}, "image_std: expected three numbers above 0"),
         ({"resample": 7}, "resample: expected a number from 0 to 5, got 7"),
-        ({"resample": "bicubic"}, "resample: expected a number from 0 to 5"),
         ({"rescale_factor": 0}, "rescale_factor: expected a number above 0"),
     ],
 )
@@ -120,7 +104,7 @@ def test_floats_are_resized_by_the_two_filters_that_there_are(copied: Any) -> No
         teacher(folder)
 
 
-@pytest.mark.parametrize("text", [None, "{", "[]"])
+@pytest.mark.parametrize("text", [None, "{"])
 def test_a_folder_without_preprocessing_is_refused(copied: Any, text: str | None) -> None:
     path = copied("clip") / "preprocessor_config.json"
     path.unlink()
@@ -130,7 +114,7 @@ def test_a_folder_without_preprocessing_is_refused(copied: Any, text: str | None
         teacher(path.parent)
 
 
-@pytest.mark.parametrize("kind", ["clip", "dinov2", "dinov3", "sam", "llava"])
+@pytest.mark.parametrize("kind", ["sam", "llava"])
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -157,8 +141,7 @@ def test_weights_that_do_not_fit_are_refused(copied: Any, kind: str, spoil: str,
         teacher(folder)
 
 
-@pytest.mark.parametrize("kind", ["clip", "dinov2", "dinov3", "sam", "llava"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize(("kind", "value"), [("clip", float("nan")), ("sam", float("inf")), ("llava", float("nan"))])
 def test_weights_that_are_not_finite_are_refused_by_name(copied: Any, kind: str, value: float) -> None:
     folder = copied(kind)
     last = f".{LAYERS - 1}." if kind != "sam" else f"vision_encoder.layers.{LAYERS - 1}."

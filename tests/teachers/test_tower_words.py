@@ -62,13 +62,12 @@ def built(teacher: TeacherConfig, text: TextConfig) -> Any:
 
 
 @pytest.mark.parametrize("kind", ["clip", "siglip"])
-@pytest.mark.parametrize("dense", ["auto", "values", "summary"])
+@pytest.mark.parametrize("dense", ["auto", "summary"])
 def test_one_folder_gives_both_sides_of_a_joint_space(save_joint: SaveJoint, kind: str, dense: Any) -> None:
     folder = str(save_joint(kind))
     text = TransformersTextConfig(model=folder)
     config = TransformersConfig(model=folder, dense=dense)
     words = words_of(config, text)
-    assert words is not None
     teacher = build_teacher(config, Scene(name="s"), words)
     assert teacher.space.text_encoder == words.space.text_encoder
     assert teacher.space.channels == words.space.channels
@@ -89,7 +88,6 @@ def test_a_summary_of_a_picture_of_one_patch_is_the_pictures_own(save_joint: Sav
     pixels = torch.from_numpy(patch.astype(np.float32)).permute(2, 0, 1)[None] / 127.5 - 1
     with torch.inference_mode():
         expected = model.get_image_features(pixel_values=pixels, interpolate_pos_encoding=True).pooler_output
-    assert made is not None
     np.testing.assert_allclose(made[0], expected, atol=1e-5)
 
 
@@ -188,7 +186,6 @@ def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str,
     config = replace(config, size=vision_towers.SIDE)
     views = Views(cameras=front_camera(30, 20), names=("a",), images=[vision_towers.picture(20, 30)])
     features = build_teacher(config, Scene(name="s"), None).feature_map(views, 0).features
-    assert features is not None
     assert features.shape[:2] == (3, 4)
 
 
@@ -197,10 +194,7 @@ def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str,
     ("words", "message"),
     [
         ([], "teacher.model= is missing"),
-        (["teacher.model=nowhere"], "teacher.model: no folder at nowhere"),
         (["teacher.model=nowhere", "teacher.layer=-2", "text=transformers", "text.model=a"], "no words lead into"),
-        (["teacher.large=tiles"], "teacher.large: expected one of interpolate, windows"),
-        (["teacher.size=-3"], "teacher.size: expected 0 to 8,192"),
     ],
 )
 def test_a_fusion_that_cannot_be_is_refused_in_one_line(

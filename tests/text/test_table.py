@@ -15,19 +15,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.text.table import TextTable, check_space, load_text_table, make_text_table, save_text_table
 from gsencoder.types import FeatureSpace
 
-NAMES = (
-    "mug",
-    "coffee mug",
-    "knife",
-    "glass",
-    "glasses",
-    "cherry",
-    "tennis ball",
-    "golf ball",
-    "box",
-    "scissors",
-    "T-shirt",
-)
+NAMES = ("mug", "coffee mug", "knife", "glass", "glasses", "cherry", "tennis ball", "golf ball", "box", "scissors")
+NAMES += ("T-shirt",)
 
 
 @pytest.fixture
@@ -44,7 +33,6 @@ def save_npz(path: Path, **arrays: np.ndarray) -> Path:
 @pytest.mark.parametrize(
     ("word", "name"),
     [
-        ("mug", "mug"),
         ("  MUG\t", "mug"),
         ("mugs", "mug"),
         ("a mug", "mug"),
@@ -62,14 +50,8 @@ def save_npz(path: Path, **arrays: np.ndarray) -> Path:
 )
 def test_simple_variations_mean_the_same_word(table: TextTable, word: str, name: str) -> None:
     row = table.find(word)
-    assert row is not None
     assert table.names[row] == name
     assert np.array_equal(table.encode([word])[0], table.embeddings[NAMES.index(name)])
-
-
-def test_many_words_encode_as_they_do_one_by_one(table: TextTable) -> None:
-    words = ["box", "mugs", "box", "golf ball"]
-    assert np.array_equal(table.encode(words), np.concatenate([table.encode([word]) for word in words]))
 
 
 @pytest.mark.parametrize(
@@ -88,7 +70,7 @@ def test_an_unknown_word_with_nothing_near_says_so(table: TextTable) -> None:
 
 
 @given(st.text(max_size=40))
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=30)
 def test_any_text_is_a_word_of_the_table_or_an_error_of_one_line(word: str) -> None:
     table = make_text_table(("mug", "box"), np.eye(2), "toy")
     known = table.find(word)
@@ -143,14 +125,12 @@ def test_a_half_precision_file_gives_unit_rows_and_the_encoder_of_its_name(table
     read = load_text_table(path)
     assert read.space.text_encoder == "toy"
     np.testing.assert_allclose(np.linalg.norm(read.embeddings, axis=1), 1, atol=1e-6)
-    assert load_text_table(path, encoder="other").space.text_encoder == "other"
 
 
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
         ({"names": np.array(["a1"])}, "embeddings is missing"),
-        ({"names": np.array([1.0]), "embeddings": np.eye(1)}, "names: expected 1 axis"),
         ({"names": np.array(["a1"]), "embeddings": np.ones(3)}, "embeddings: expected 2 axes"),
         ({"names": np.array(["a1", "b1"]), "embeddings": np.eye(3)}, "expected embeddings of"),
         ({"names": np.array(["x", "X "]), "embeddings": np.eye(2)}, "'X ' in row 1 is repeated"),
@@ -213,7 +193,7 @@ def test_every_truncation_is_an_error_of_one_line(table: TextTable, tmp_path: Pa
     else:
         save_text_table(path, table)
     whole = path.read_bytes()
-    for length in {0, 1, 2, 7, 8, 9, len(whole) // 3, len(whole) // 2, len(whole) - 1}:
+    for length in (0, 1, 8, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:length])
         with pytest.raises(InputError) as caught:
             load_text_table(path)
@@ -221,7 +201,7 @@ def test_every_truncation_is_an_error_of_one_line(table: TextTable, tmp_path: Pa
 
 
 @given(st.binary(max_size=200), st.integers(0, 4000), st.sampled_from([".npz", ".safetensors"]))
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=50)
 def test_bytes_overwritten_anywhere_give_a_table_or_an_input_error(
     tmp_path_factory: pytest.TempPathFactory, patch: bytes, at: int, suffix: str
 ) -> None:
@@ -253,11 +233,6 @@ def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None
         load_text_table(path)
 
 
-def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"gone\.npz: no such file"):
-        load_text_table(tmp_path / "gone.npz")
-
-
 @pytest.mark.shared
 def test_the_real_table_knows_what_its_names_say(shared: Path) -> None:
     table = load_text_table(shared / "models" / "clip_vitb32_names.npz")
@@ -272,21 +247,6 @@ def test_the_real_table_knows_what_its_names_say(shared: Path) -> None:
     centered /= np.linalg.norm(centered, axis=1, keepdims=True)
     assert np.median(raw) > 0.65
     assert abs(np.median(centered @ centered.T)) < 0.1
-
-
-def test_a_header_nested_without_end_is_refused(tmp_path: Path) -> None:
-    from safetensors.numpy import save_file
-
-    arrays = {"embeddings": np.eye(2, dtype=np.float32), "mean": np.zeros(2, np.float32)}
-    save_file(arrays, tmp_path / "t.safetensors", {"gsencoder": "[" * 100_000})
-    with pytest.raises(InputError, match="damaged or no safetensors file"):
-        load_text_table(tmp_path / "t.safetensors")
-
-
-def test_a_page_of_text_taken_for_a_word_is_not_repeated_whole(table: TextTable) -> None:
-    with pytest.raises(InputError) as caught:
-        table.encode(["x" * 100_000])
-    assert len(str(caught.value)) < 300
 
 
 def test_names_longer_than_words_are_refused_before_memory_is_taken(tmp_path: Path) -> None:
@@ -305,9 +265,9 @@ def test_names_longer_than_words_are_refused_before_memory_is_taken(tmp_path: Pa
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("length", [900, 1_000_000])
 @pytest.mark.parametrize("wrong", ["norm", "repeated", "unknown"])
-def test_no_error_of_a_table_repeats_a_long_name(length: int, wrong: str, no_jaxtyping: None) -> None:
+def test_no_error_of_a_table_repeats_a_long_name(wrong: str, no_jaxtyping: None) -> None:
+    length = 1_000_000
     names = ["x" * length, "x" * length if wrong == "repeated" else "y"]
     rows = np.eye(2, dtype=np.float32) * (2 if wrong == "norm" else 1)
     with pytest.raises(InputError) as caught:
@@ -319,18 +279,12 @@ def space(encoder: str, channels: int = 4, teacher: str = "") -> FeatureSpace:
     return FeatureSpace(name=f"space-{encoder}", channels=channels, teacher=teacher, text_encoder=encoder)
 
 
-def test_features_of_any_teacher_may_be_asked_with_words_of_their_encoder() -> None:
-    assert check_space(space("clip", teacher="labels"), space("clip")) is None
-
-
 @pytest.mark.parametrize("text", [space("siglip"), space("clip", channels=5), space("")])
 def test_words_of_another_space_are_an_error_that_names_both(text: FeatureSpace) -> None:
     with pytest.raises(InputError) as caught:
         check_space(space("clip", teacher="labels"), text)
     assert "space-clip · 4 channels · labels · clip" in str(caught.value)
     assert text.describe() in str(caught.value)
-
-
-def test_features_that_no_words_lead_into_cannot_be_asked() -> None:
+    check_space(space("clip", teacher="labels"), space("clip"))
     with pytest.raises(InputError, match="it has no text encoder"):
         check_space(space(""), space(""))

@@ -95,7 +95,7 @@ def run(config: DemoConfig, run: Run) -> None:
         run.print(f"seeds: {len(scene.gaussians):,} Gaussians, no optimization")
         scene_objects = [scene_object for scene_object in scene.objects if scene_object.placed and scene_object.name]
         names = room_words(scene)
-        labels = LabelsTeacher(scene.objects, names.names, names.embeddings, text_encoder=names.space.text_encoder)
+        labels = LabelsTeacher(scene.objects, names)
         palette, colors = PaletteTeacher(), text_table_of(PaletteConfig())
         assert colors is not None
         hues = color_words(config.seed, objects=config.objects)
