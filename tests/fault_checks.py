@@ -149,7 +149,7 @@ class Checker:
             wrong += self.message(done, folder, action)
             if left := [name for name in contents(folder) if ".partial-" in name or name.endswith(".tmp")]:
                 wrong.append(f"temporary files are left: {sorted(map(role, left))[:4]}")
-        if self.inputs() != ref.inputs:
+        if not ref.inputs.items() <= self.inputs().items():
             wrong.append("inputs were changed")
         # What a killed run left in hidden folders is removed by the next, whatever it is.
         left = json.dumps([tidy(hidden(contents(folder))), sorted(hidden(dict.fromkeys(folders(folder), "")))])

@@ -49,9 +49,6 @@ def colmap_cameras(cameras: Cameras) -> Iterator[tuple[Any, Any]]:
         yield camera, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3])
 
 
-# Projection and its inverse.
-
-
 @pytest.mark.parametrize("length", EXTREME)
 def test_unprojecting_what_was_projected_gives_the_points_again_also_behind_the_camera(length):
     cameras = random_cameras(spread=length)
@@ -79,12 +76,16 @@ def test_projecting_what_was_unprojected_gives_the_pixels_and_depths_again(seed,
     np.testing.assert_allclose(again, pixels, rtol=0, atol=2e4 * np.finfo(kind).eps)
 
 
-@pytest.mark.slow
 def test_projection_is_that_of_colmap():
     """COLMAP's pixel centers lie at .5, too, so that nothing is added or taken off."""
     cameras, points = random_cameras(), some_points(200)
     compared = 0
     for view, (camera, cam_from_world) in enumerate(colmap_cameras(cameras)):
+        expected = np.asarray(cam_from_world.inverse().matrix())
+        np.testing.assert_allclose(cameras.world_from_cam[view, :3], expected, atol=1e-5)
+        np.testing.assert_allclose(cameras.centers[view], expected[:, 3], atol=1e-5)
+        turned = transform(cameras.world_from_cam[view], points) - cameras.centers[view]
+        np.testing.assert_allclose(cameras.rotate_to_world(points, view), turned, atol=1e-12)
         local = np.asarray(cam_from_world * points)
         pixels, depths = cameras.project(points, view)
         np.testing.assert_allclose(depths, local[:, 2], atol=1e-5)
@@ -110,6 +111,7 @@ def test_all_cameras_at_once_are_each_camera_after_the_other():
             each, z = cameras.project(points, view, min_depth=min_depth)
             np.testing.assert_allclose(pixels[view], each, rtol=1e-5)
             np.testing.assert_allclose(depths[view], z, rtol=1e-5)
+            assert each.dtype == z.dtype == pixels.dtype == np.float32
             assert np.array_equal(inside[view], cameras.in_image(pixels[view], depths[view], view, near=0.2))
 
 
@@ -168,9 +170,6 @@ def test_rays_have_depth_one_and_go_through_the_pixel_centers():
             np.testing.assert_allclose(pixels.reshape(height, width, 2), pixel_centers(width, height), atol=1e-2)
         corner = cameras.rays(view, np.array([[0.5, 0.5], [width - 0.5, height - 0.5]]))
         np.testing.assert_array_equal(corner, [rays[0, 0], rays[-1, -1]])
-
-
-# Rigid transforms.
 
 
 @pytest.mark.parametrize("length", EXTREME)

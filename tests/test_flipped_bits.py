@@ -1,9 +1,13 @@
 """A disk that flips a bit: whoever reads the file says so, or what he reads is what was written.
 
-Each kind of array file that is read back is made, and read after each of 60 flips of a bit somewhere in it.
+Each kind of file that is read back is made, and read after each of 30 flips of a bit somewhere in it. Archives have
+checksums. Of all other files, either the file has a checksum (rows of prompts and of answers,
+pictures of prompts by their names), or it is compared with what the run asks for (settings of a fusion, summaries of
+finished scenes), or the summary of the run that wrote it lists its checksum, and the reader warns.
 """
 
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from hashlib import sha256
@@ -16,12 +20,23 @@ import torch
 from archives import flip_bit
 from feature_fields import make_features
 from memory_samples import make_memory
+from scene_files import write_transforms
 from splats import front_camera, random_gaussians
 from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
+from tuning_pairs import png
 
-from gsencoder.core.archive import open_archive
-from gsencoder.core.errors import InputError
-from gsencoder.fusion.checkpoint import read_map, write_map
+from gsencoder.app.options import SharedScenesConfig
+from gsencoder.app.output import Summary, output_file, output_folder
+from gsencoder.app.run import Run, _is_finished
+from gsencoder.core.archive import open_archive, write_archive
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files import check_written, checksums_of, sealed, write_bytes, write_json
+from gsencoder.data.labels.files import read_checked
+from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
+from gsencoder.data.readers.transforms_json import read_json
+from gsencoder.data.splats.files import load_splat, save_splat
+from gsencoder.evaluate.tradeoff.measure import RECORDS_FILE, Records
+from gsencoder.fusion.checkpoint import SETTINGS_FILE, CachedTeacher, read_map, write_map
 from gsencoder.fusion.folder import (
     FEATURES_FILE,
     MEMORY_FILE,
@@ -33,6 +48,8 @@ from gsencoder.fusion.folder import (
 )
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, load_heads, save_heads
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
+from gsencoder.infer.ask.batch import ANSWERS, _answered
+from gsencoder.infer.ask.questions import read_answers
 from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
@@ -40,10 +57,11 @@ from gsencoder.reconstruct.parameters import RowAdam, State, anchor_at, load_sta
 from gsencoder.teachers.heads import Head
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE
+from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE, PreparedDataset
 from gsencoder.types import FeatureSpace, Scene, Views
 
-FLIPS = 60
+FLIPS = 30
+SETTINGS = {"fuse": {"views": 3, "rays": 1.5}, "teacher": {"name": "palette"}}
 Made = tuple[Path, Callable[[], Any]]
 
 
@@ -195,6 +213,76 @@ KINDS: dict[str, Callable[[Path], Made]] = {
 }
 
 
+def prompts(folder: Path, name: str) -> Made:
+    store = PromptStore(folder)
+    for number in range(2):
+        store.add(f"key {number}", f"What is number {number}?", [png(number)])
+    rows = {key: (prompt.text, prompt.pictures) for key, prompt in store.prompts.items()}
+    if name == PROMPTS_FILE:
+        # A last line without its end counts as cut off, and its prompt is made again.
+        return folder / name, lambda: rows | {k: (p.text, p.pictures) for k, p in PromptStore(folder).prompts.items()}
+    (first, *_) = store.prompts["key 0"].pictures
+    return folder / "pictures" / first, lambda: store.picture(first).tolist()
+
+
+def answers(folder: Path) -> Made:
+    row = {"id": "1", "digest": "d", "answer": "On the left.", "tokens": {"prompt": 7}, "seconds": 0.25}
+    write_bytes(folder / ANSWERS, json.dumps(sealed(row)).encode() + b"\n")
+    (folder / "d").mkdir()
+    # A question whose answer is not recognized is asked again.
+    return folder / ANSWERS, lambda: _answered(folder, {"1": "d"}) or {"1": row}
+
+
+def fusion(folder: Path) -> Made:
+    write_json(folder / SETTINGS_FILE, SETTINGS)
+    return folder / SETTINGS_FILE, lambda: CachedTeacher(DenseSideTeacher(), folder, SETTINGS)._settings
+
+
+def finished(folder: Path) -> Made:
+    run = Run("fuse", SharedScenesConfig())
+    with output_folder(folder / "out", summary=run) as out:
+        (out / "a.txt").write_text("x")
+    return folder / "out" / "summary.json", lambda: _is_finished(folder / "out", run)
+
+
+def written(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]) -> Callable[[Path], Made]:
+    """A file in the results of a run, in a folder of them."""
+
+    def make(folder: Path) -> Made:
+        with output_folder(folder / "out", summary=Summary("test", {})) as out:
+            (out / "deep").mkdir()
+            write(out / "deep")
+        return folder / "out" / "deep" / name, lambda: read(folder / "out" / "deep" / name)
+
+    return make
+
+
+def beside(folder: Path) -> Made:
+    with output_file(folder / "new.ply", overwrite=False, summary=Summary("repair", {})):
+        save_splat(folder / "new.ply", random_gaussians(20))
+    return folder / "new.ply", lambda: _arrays(load_splat(folder / "new.ply"))
+
+
+def _arrays(splat: Any) -> list[Any]:
+    return [getattr(splat, name).tolist() for name in ("means", "quats", "scales", "opacities", "sh")]
+
+
+ROWS = [{"scene_id": "a", "object_id": 3, "label": "mug", "score": 0.5}]
+OTHERS: dict[str, Callable[[Path], Made]] = {
+    "rows of prompts": lambda folder: prompts(folder, PROMPTS_FILE),
+    "picture of a prompt": lambda folder: prompts(folder, "picture"),
+    "answers of an unfinished run": answers,
+    "settings of a fusion": fusion,
+    "summary of a finished scene": finished,
+    "answers": written(ANSWERS, lambda out: write_bytes(out / ANSWERS, b'{"id": "1", "answer": "x"}\n'), read_answers),
+    "predictions": written("p.json", lambda out: write_json(out / "p.json", ROWS), read_checked),
+    "classes": written("c.csv", lambda out: write_bytes(out / "c.csv", b"id,name\n3,mug\n"), read_checked),
+    "transforms": written("transforms.json", lambda out: write_transforms(out, 1), read_json),
+    "splat": written("s.ply", lambda o: save_splat(o / "s.ply", random_gaussians(9)), lambda p: _arrays(load_splat(p))),
+    "splat of one file": beside,
+}  # fmt: skip
+
+
 def digest(value: Any) -> str:
     """Of everything in what a reader gives."""
     return sha256(json.dumps(plain(value), sort_keys=True).encode()).hexdigest()
@@ -209,26 +297,68 @@ def plain(value: Any) -> Any:
         return plain([getattr(value, name) for name in value.__dataclass_fields__])
     if isinstance(value, dict):
         return {str(key): plain(entry) for key, entry in value.items()}
-    return [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    return str(value) if isinstance(value, (Path, bytes)) else value
+
+
+def warned_or_read(read: Callable[[], Any]) -> str:
+    """The digest of what a reader gives, whose warnings are errors."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SceneWarning)
+        return digest(read())
 
 
 @pytest.mark.usefixtures("no_jaxtyping")
-@pytest.mark.parametrize("kind", KINDS)
-def test_no_flipped_bit_changes_what_is_read_without_an_error(kind: str, tmp_path: Path) -> None:
-    path, read = KINDS[kind](tmp_path)
-    sound, expected = path.read_bytes(), digest(read())
-    assert digest(read()) == expected
+@pytest.mark.parametrize("kind", [*KINDS, *OTHERS])
+def test_no_flipped_bit_changes_what_is_read_without_a_word(kind: str, tmp_path: Path) -> None:
+    path, read = (KINDS | OTHERS)[kind](tmp_path)
+    sound, expected = path.read_bytes(), warned_or_read(read)
+    assert warned_or_read(read) == expected
     refused = 0
     for bit in np.random.default_rng(0).integers(0, 8 * len(sound), FLIPS).tolist():
         flip_bit(path, bit)
         try:
-            got = digest(read())
-        except InputError as error:
+            got = warned_or_read(read)
+        except (InputError, SceneWarning) as error:
             refused += 1
-            assert str(path) in str(error) or kind == "splat of a package"
+            assert str(path if kind in KINDS else path.parent) in str(error) or kind == "splat of a package"
         else:
             assert got == expected, f"bit {bit} of {8 * len(sound)}"
         path.write_bytes(sound)
-    # Most flips are in arrays, where every one of them matters.
-    assert refused > FLIPS // 2
-    assert digest(read()) == expected
+    # Most flips of archives are in arrays, where every one of them matters.
+    assert refused > (FLIPS // 2 if kind in KINDS else 0)
+    assert warned_or_read(read) == expected
+
+
+def test_of_the_files_of_a_run_those_without_checksums_of_their_own_are_listed(tmp_path: Path) -> None:
+    write_archive(tmp_path / "features.safetensors", {"a": np.ones(3)}, {})
+    (tmp_path / "adapter_model.safetensors").write_bytes(b"\2\0\0\0\0\0\0\0{}")
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "a.json").write_text("{}")
+    assert set(checksums_of(tmp_path)) == {"adapter_model.safetensors", "deep/a.json"}
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"files": 3}', '{"files": {"a": 3}}', "\0"])
+def test_a_summary_without_checksums_says_nothing_of_files(content: str, tmp_path: Path) -> None:
+    (tmp_path / "summary.json").write_text(content)
+    (tmp_path / "a").write_text("x")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_written(tmp_path / "a")
+        check_written(tmp_path / "missing")
+
+
+def test_a_file_of_a_run_that_the_disk_does_not_give_back_is_named(tmp_path: Path) -> None:
+    # Opens like any file, and gives an I/O error at its first byte.
+    bad = Path("/proc/self/mem")
+    if not bad.exists():
+        pytest.skip("needs /proc, as Linux has it")
+    for name in (RECORDS_FILE, SPACE_FILE, "a.txt"):
+        (tmp_path / name).symlink_to(bad)
+    with pytest.raises(InputError, match=r"a\.txt: cannot be read: Input/output error"):
+        checksums_of(tmp_path)
+    with pytest.raises(InputError, match=rf"{RECORDS_FILE}: cannot be read: Input/output error"):
+        Records(tmp_path, {})
+    with pytest.raises(InputError, match=rf"{SPACE_FILE}: .*Input/output error"):
+        PreparedDataset(tmp_path)

@@ -31,6 +31,7 @@ def test_rotation_matrices_agree_with_scipy():
     quats = random_quats(50)
     expected = Rotation.from_quat(quats.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     np.testing.assert_allclose(rotmats_from_quats(quats).numpy(), expected, atol=1e-12)
+    torch.testing.assert_close(rotmats_from_quats(quats), rotmats_from_quats(-quats))
 
 
 def test_normalising_a_zero_quaternion_has_a_finite_value_and_gradient():

@@ -13,7 +13,6 @@ from gsencoder.app import main as cli
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import load_splat
 from gsencoder.evaluate.benchmarks.localization import aabb_iou
-from gsencoder.fusion.folder import load_features
 
 pytestmark = pytest.mark.slow
 
@@ -138,16 +137,6 @@ def test_a_room_a_million_metres_away_gives_the_same_boxes_there(demo: Path, tmp
     np.testing.assert_allclose(corners[1] - shift, corners[0], atol=0.01)
 
 
-def test_a_splat_without_views_is_fused_from_orbits(demo: Path, tmp_path: Path) -> None:
-    out = tmp_path / "features"
-    fused = ["fuse", str(demo / "splat.ply"), "teacher=palette", "orbits=3", "data.up=[0,0,1]", f"out={out}"]
-    assert cli.main([*fused, "quiet=true"]) == 0
-    scene = load_features(out)
-    assert scene.views is not None
-    assert len(scene.views) == 3
-    assert cli.main(["localize", str(out), "query=red", f"out={tmp_path / 'boxes'}", "quiet=true"]) == 0
-
-
 def test_a_word_outside_the_table_is_refused_with_the_near_ones(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -169,7 +158,7 @@ def test_features_beside_another_splat_are_refused(
 
 @pytest.mark.parametrize(
     "wrong",
-    ["views=0", "width=3", "objects=0", "objects=1000", "seed=-1", "seeds.voxel=0", "localize.threshold.fixed=2"],
+    ["views=0", "objects=1000", "seeds.voxel=0", "localize.threshold.fixed=2"],
 )
 def test_the_demo_refuses_what_it_cannot_do(wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = refusal(capsys, "demo", wrong, f"out={tmp_path / 'demo'}")

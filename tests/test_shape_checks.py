@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import shape_checks
 from beartype import beartype
-from jaxtyping import Float32, Float64, Int32, TypeCheckError
+from jaxtyping import Float32, Int32, TypeCheckError
 from shape_checks import checked
 
 from gsencoder.core.files import plain
-from gsencoder.types import FeatureMap, FeatureSpace, Gaussians
+from gsencoder.types import Gaussians
 from gsencoder.types.scene import pixel_centers
 
 
@@ -31,26 +31,20 @@ def zeros(*shape: int) -> np.ndarray:
     return np.zeros(shape, np.float32)
 
 
-def test_what_fits_its_annotations_is_returned() -> None:
-    assert joined(zeros(4, 3), b=zeros(4, 2)).shape == (4, 5)
-
-
 @pytest.mark.parametrize(
     ("a", "b", "rows"),
     [
         (zeros(4, 2), zeros(4, 2), 0),
         (zeros(4, 3), zeros(5, 2), 0),
-        (zeros(4, 3).astype(np.float64), zeros(4, 2), 0),
-        (zeros(4, 3), zeros(4), 0),
         (zeros(4, 3), [1.0], 0),
         (zeros(4, 3), zeros(4, 2), "0"),
         (zeros(4, 3), zeros(4, 2), 1),  # An axis of the result has the size that it has in the arguments.
     ],
 )
 def test_what_does_not_fit_is_refused(a: Any, b: Any, rows: Any) -> None:
-    with pytest.raises((TypeCheckError, ValueError)) as caught:
+    assert joined(zeros(4, 3), b=zeros(4, 2)).shape == (4, 5)
+    with pytest.raises(TypeCheckError):
         joined(a, b, rows=rows)
-    assert caught.type is TypeCheckError
 
 
 def test_axes_of_one_name_are_those_of_one_call() -> None:
@@ -89,15 +83,9 @@ def test_every_kind_of_parameter_is_checked() -> None:
         return a + b + sum(more) + c + sum(others.values())
 
     assert (kinds(1), kinds(1, 2, 3, 4, c=5, d=6)) == (1, 21)
-    for args, kwargs in (
-        (("1",), {}),
-        ((1,), {"b": "2"}),
-        ((1, 2, "3"), {}),
-        ((1,), {"c": "5"}),
-        ((1,), {"d": "6"}),
-    ):
+    for args, more in ((("1",), {}), ((1,), {"b": "2"}), ((1, 2, "3"), {}), ((1,), {"c": "5"}), ((1,), {"d": "6"})):
         with pytest.raises(TypeCheckError):
-            kinds(*args, **kwargs)
+            kinds(*args, **more)
     with pytest.raises(TypeError, match="argument"):
         kinds()
 
@@ -143,11 +131,3 @@ def test_the_package_is_under_them() -> None:
     assert hasattr(Gaussians.__init__, "has_checks")
     with pytest.raises(TypeCheckError):
         pixel_centers("4", 3)  # type: ignore[arg-type]
-    with pytest.raises(TypeCheckError):
-        FeatureMap(
-            features=zeros(2, 2, 3).astype(np.float64),
-            grid_from_image=np.zeros((2, 3)),
-            space=FeatureSpace(name="three", channels=3),
-        )
-    centers: Float64[np.ndarray, "3 4 2"] = pixel_centers(4, 3)
-    assert centers.shape == (3, 4, 2)

@@ -20,9 +20,11 @@ from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.localize import localize
 from gsencoder.models.output_space import SHIPPED_WEIGHTS
 from gsencoder.models.weights import load_weights
+from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import words_of_table
 from gsencoder.train.loop import CHANGEABLE_ON_RESUME
 from gsencoder.train.samples import Augmentation
+from gsencoder.types import GaussianFeatures, Scene
 
 pytestmark = pytest.mark.slow
 
@@ -68,12 +70,22 @@ def test_those_of_several_teachers_have_the_settings_of_their_experiment() -> No
     assert made_with["augment"] == asdict(Augmentation())
 
 
-def test_phrases_lead_into_the_space_of_a_sentence_encoder(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def unseen_room(shared: Path, number: int) -> Scene:
+    # What eight views show is enough for several parts, of which each has neighbors.
+    views = SceneConfig(max_views=8)
+    return with_gaussians(load_scene(shared / "scenes" / "house" / f"train_{number:03d}", options=views))
+
+
+def accuracy(scene: Scene, features: GaussianFeatures, words: TextTable) -> float:
+    counts = NamingProtocol().start(Evaluation(words=words)).predict(scene, features)
+    return naming_scores([counts])["accuracy"]
+
+
+def test_an_unseen_room_is_named_and_found_by_phrases(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSENCODER_MODELS", str(shared / "models"))
-    encoder = Encoder.load("house")
-    scene = with_gaussians(load_scene(shared / "scenes" / "house" / "train_045"))
-    assert scene.gaussians is not None
+    encoder, scene = Encoder.load("house"), unseen_room(shared, 45)
     encoded = encoder.encode_spaces(scene.gaussians)
+    assert accuracy(scene, encoded["labels"], encoder.tables["labels"]) >= 0.7
     words = words_of_table(encoder.tables["labels"])
     localization = localize(replace(scene, features=encoded), ["something to sit on"], words, space="labels")
     best = localization.boxes[0]
@@ -84,22 +96,11 @@ def test_phrases_lead_into_the_space_of_a_sentence_encoder(shared: Path, monkeyp
         localize(replace(scene, features=encoded), ["mug"], words, space="dinov2_s14")
 
 
-@pytest.mark.parametrize(("name", "number"), [("house_cpu", 40), ("house", 45)])
-def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, name: str, number: int) -> None:
-    encoder = Encoder.load(name)
-    words = encoder.tables["labels"]
-    # What eight views show is enough for several parts, of which each has neighbors.
-    views = SceneConfig(max_views=8)
-    scene = with_gaussians(load_scene(shared / "scenes" / "house" / f"train_{number:03d}", options=views))
-    assert scene.gaussians is not None
+def test_an_unseen_room_is_named_in_parts_as_in_one(shared: Path) -> None:
+    encoder, scene = Encoder.load("house_cpu"), unseen_room(shared, 40)
     assert len(scene.gaussians) > 90_000
-    accuracies, features = [], []
-    for chunk in (0, 40_000):
-        given = encoder.encode(scene.gaussians, EncodeConfig(chunk=chunk), space="labels")
-        counts = NamingProtocol().start(Evaluation(words=words)).predict(scene, given)
-        accuracies.append(naming_scores([counts])["accuracy"])
-        features.append(given)
-    assert accuracies[0] >= 0.7
-    assert accuracies[1] >= accuracies[0] - 0.01
-    whole, parts = features
+    whole, parts = (encoder.encode(scene.gaussians, EncodeConfig(chunk=chunk)) for chunk in (0, 40_000))
+    in_one, in_parts = (accuracy(scene, features, encoder.tables["labels"]) for features in (whole, parts))
+    assert in_one >= 0.7
+    assert in_parts >= in_one - 0.01
     assert 0 < field_error(parts, whole).centered <= 0.02

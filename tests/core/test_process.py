@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gsencoder.core.device import autocast_dtype
-from gsencoder.core.errors import InputError, counted
+from gsencoder.core.errors import InputError
 from gsencoder.core.process import (
     SIGNALS,
     Clock,
@@ -45,16 +45,14 @@ def test_slurm_tells_rank_and_size_and_where_to_meet() -> None:
     process, meeting = rank_from_environment(SLURM)
     assert (process.rank, process.world_size, process.local_rank) == (5, 8, 1)
     assert meeting == "tcp://gpu03:23456"
-
-
-def test_a_batch_script_itself_is_one_process() -> None:
+    # A batch script itself is one process.
     environment = {name: value for name, value in SLURM.items() if name != "SLURM_STEP_ID"}
     assert rank_from_environment(environment) == (ProcessRank(), "")
 
 
 @pytest.mark.parametrize(
     ("nodes", "host"),
-    [("a", "a"), ("a,b", "a"), ("a[1,3]", "a1"), ("a[001-200]", "a001"), ("n[2-3].x.org,m", "n2.x.org")],
+    [("a,b", "a"), ("a[001-200]", "a001"), ("n[2,3].x.org,m", "n2.x.org")],
 )
 def test_the_first_machine_of_a_list(nodes: str, host: str) -> None:
     assert first_host(nodes) == host
@@ -71,16 +69,6 @@ def test_the_first_machine_of_a_list(nodes: str, host: str) -> None:
 def test_an_environment_that_contradicts_itself_is_refused(environment: dict[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         rank_from_environment(environment)
-
-
-def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([10.0, 11.0, 20.0, 22.5, 30.0, 34.0])
-    monkeypatch.setattr("gsencoder.core.process.time.perf_counter", lambda: next(times))
-    clock = Clock()
-    for step in ("blend", "lift", "blend"):
-        with clock(step):
-            pass
-    assert clock.seconds == {"blend": 5.0, "lift": 2.5}
 
 
 def test_marked_functions_count_on_the_clock_that_runs_and_on_none_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,16 +116,6 @@ def test_automatic_precision_is_bfloat16_only_where_the_processor_multiplies_it(
     for device in ("cpu", "cuda"):
         assert autocast_dtype("bfloat16", torch.device(device), training=training) == torch.bfloat16
         assert autocast_dtype("float32", torch.device(device), training=training) is None
-
-
-def test_a_noun_has_an_s_where_there_is_not_one() -> None:
-    assert [counted(number, "scene") for number in (0, 1, 2, 1200)] == [
-        "0 scenes",
-        "1 scene",
-        "2 scenes",
-        "1,200 scenes",
-    ]
-    assert [counted(number, "class", "classes") for number in (1, 2)] == ["1 class", "2 classes"]
 
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")

@@ -9,13 +9,6 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.logs import LOG_FILE, Log, read_log
 
 
-def test_rows_are_read_back(tmp_path: Path) -> None:
-    log = Log(tmp_path, done=0, events=False)
-    log.add(0, {"loss": 1.5})
-    log.add(1, {"loss": 0.5})
-    assert read_log(tmp_path / LOG_FILE) == [{"step": "0", "loss": "1.5"}, {"step": "1", "loss": "0.5"}]
-
-
 def test_columns_may_be_added_on_the_way(tmp_path: Path) -> None:
     log = Log(tmp_path, done=0, events=False)
     log.add(0, {"loss": 1.0})

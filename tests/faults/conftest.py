@@ -1,10 +1,12 @@
 """A server that forks runs with a fault in them; where there is no C compiler the tests are skipped, visibly."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
+from fault_checks import Checker
 from fault_runs import FaultServer, fault_server
 
 
@@ -15,3 +17,9 @@ def server() -> Iterator[FaultServer]:
         if started is None:
             pytest.skip("faults of files need Linux and a C compiler (gcc or cc)")
         yield started
+
+
+@pytest.fixture(scope="session")
+def checker(server: FaultServer, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Checker]:
+    """The checker of a command, whose runs without a fault are made once."""
+    return cache(lambda name: Checker(server, tmp_path_factory.mktemp("faults"), name))
