@@ -47,14 +47,7 @@ class Checker:
     """Puts faults into the runs of a case and says what did not hold."""
 
     def __init__(self, server: FaultServer, folder: Path, name: str, url: str = "") -> None:
-        """Runs the case without a fault, in the server and in a child.
-
-        Args:
-            server: that forks the runs.
-            folder: to work in.
-            name: of the case.
-            url: of the server of chat.
-        """
+        """Runs the case without a fault, in the server and in a child; `url` is that of the server of chat."""
         self.server, self.folder, self.name = server, folder, name
         case = CASES.get(name) or EXHAUSTIVE[name]
         server.prepare(name)
@@ -85,7 +78,6 @@ class Checker:
         return path
 
     def drop(self, path: Path) -> None:
-        """Removes a folder of a run."""
         shutil.rmtree(path)
         shutil.rmtree(path.parent / f"{path.name}.run", ignore_errors=True)
 
@@ -100,13 +92,7 @@ class Checker:
         return self.server.run(words, folder, at=at, action=action)
 
     def check(self, at: int, action: int, *, over: bool = False) -> list[str]:
-        """Puts a fault at a call; what did not hold.
-
-        Args:
-            at: number of the call.
-            action: the fault.
-            over: whether there are earlier results, which the run replaces.
-        """
+        """Puts a fault at a call; what did not hold. With `over` the run replaces earlier results."""
         ref, folder, wrong = self.reference, self.new(), []
         out = folder / ref.case.out
         more: tuple[str, ...] = ()
@@ -169,12 +155,7 @@ class Checker:
         return done.calls
 
     def check_input(self, at: int, action: int) -> list[str]:
-        """Puts a fault at the opening of an input, in a copy of all of them; what did not hold.
-
-        Args:
-            at: number of the opening.
-            action: the fault.
-        """
+        """Puts a fault at the opening of an input, in a copy of all of them; what did not hold."""
         folder, wrong, ref = self.new(), [], self.reference
         # Of the same length, since some files hold paths.
         given = self.server.given.with_name("taken")
@@ -202,7 +183,6 @@ class Checker:
         return [f"{where}: {each}" for each in wrong]
 
     def next_run(self, folder: Path, stands: bool) -> list[str]:
-        """What is wrong with the same command, given again."""
         ref = self.reference
         again = self.run(folder, *(("overwrite=true",) if stands else ()))
         if again.code != 0:
@@ -213,7 +193,6 @@ class Checker:
         return []
 
     def message(self, done: Run, folder: Path, action: int) -> list[str]:
-        """What is wrong with the line that a run ended with."""
         lines = self.errors(done)
         if done.code != 2 or len(lines) != 1 or not lines[0].startswith("error: "):
             return [f"code {done.code}: " + " / ".join(lines[-3:])[-400:]]
@@ -233,7 +212,6 @@ class Checker:
         return [line for line in done.lines if not line.startswith(beside)]
 
     def of_out(self, key: str) -> bool:
-        """Whether a file is part of the results."""
         return key.split("/")[0] == self.reference.case.out
 
     @staticmethod
@@ -265,15 +243,12 @@ def tidy(files: dict[str, str]) -> dict[str, str]:
 
 
 def state(folder: Path) -> dict[str, str]:
-    """All files below a folder with their digests."""
     return tidy(contents(folder))
 
 
 def folders(folder: Path) -> set[str]:
-    """All folders below a folder."""
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_dir()}
 
 
 def difference(first: dict[str, str], second: dict[str, str]) -> list[str]:
-    """The first files in which two states differ."""
     return sorted(name for name in {*first, *second} if first.get(name) != second.get(name))[:4]

@@ -29,25 +29,19 @@ ROOMS = ("room_a", "room_b")
 
 @dataclass(frozen=True)
 class Case:
-    """A command line without out=.
-
-    Attributes:
-        words: command and settings, of the folder of inputs.
-        out: name of what it writes; a file where it has an ending.
-        beside: what else may stay beside out= after a run that ended, and what of an unfinished one is read again.
-        server: whether it asks a server of chat.
-        several: whether it is of several scenes, each with a folder in out=.
-        packages: those that it needs beside the usual.
-        other: settings with which it writes other results, as a second run of it in the same folder.
-    """
+    """A command line without out=, and what is true of it."""
 
     words: Callable[[Path], list[str]]
     out: str = "out"
     beside: tuple[str, ...] = ()
+    """What else may stay beside out= after a run that ended, and what of an unfinished one is read again."""
     server: bool = False
+    """Whether it asks a server of chat."""
     several: bool = False
+    """Whether it is of several scenes, each with a folder in out=."""
     packages: tuple[str, ...] = ()
     other: tuple[str, ...] = ()
+    """Settings with which it writes other results, as a second run of it in the same folder."""
 
 
 def _fuse(given: Path, *more: str) -> list[str]:
@@ -177,7 +171,6 @@ EXHAUSTIVE: dict[str, Case] = {
 
 
 def words_of(case: Case, given: Path) -> list[str]:
-    """The words of a case."""
     return [word.replace("GIVEN", str(given)) for word in case.words(given)] + ["quiet=true"]
 
 

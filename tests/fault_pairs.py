@@ -10,12 +10,7 @@ from fault_runs import HALT, Run
 
 @dataclass
 class Pairs:
-    """Pairs of runs of a case; counts how they came out.
-
-    Attributes:
-        checker: of the case, whose run is the one that stands still.
-        outcomes: how often the first, the second or both of the two ended well.
-    """
+    """Pairs of runs of a case, and how often the first, the second or both of the two ended well."""
 
     checker: Checker
     outcomes: dict[str, int] = field(default_factory=dict)
@@ -31,12 +26,8 @@ class Pairs:
         checker.drop(folder)
 
     def check(self, at: int, *, over: bool = False) -> list[str]:
-        """Lets the first run stand still before a call, and runs the second; what did not hold.
-
-        Args:
-            at: number of the call.
-            over: whether both are to replace results that are there.
-        """
+        """Lets the first run stand still before a call, and runs the second; what did not hold. With `over` both
+        replace results that are there."""
         checker, ref = self.checker, self.checker.reference
         folder = checker.new()
         more: tuple[str, ...] = ()

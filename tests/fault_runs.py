@@ -22,24 +22,14 @@ COUNT, KILL, TEAR, FULL, IO_ERROR, SHORT, SHORT_FULL, DENY, VANISH, CUT, READ_ER
 """What `fault_shim.c` does at the call that is asked for: nothing; end the process before it, or in the middle of it;
 a disk that is full from then on; one error; a short write, alone or before a full disk; of inputs: refuse, remove or
 halve the file, and an error of reading; stop before it until another run has ended."""
-VOLATILE = (
-    "timings",
-    "peak_memory_mb",
-    "versions",
-    "platform",
-    "seconds",
-    "seconds_per_step",
-    "mib",
-    "settings",
-    "files",
-    "continued",
-)
+VOLATILE = {"timings", "peak_memory_mb", "versions", "platform", "seconds", "seconds_per_step", "mib", "settings"}
+VOLATILE |= {"files", "continued"}
 """Keys of JSON values in which two runs differ; `continued` counts what a run took over from an unfinished one."""
 
 
 @dataclass(frozen=True)
 class Call:
-    """A counted call: its number, its name, bytes and the file."""
+    """A counted call with its bytes and its file."""
 
     number: int
     name: str
@@ -49,20 +39,15 @@ class Call:
 
 @dataclass(frozen=True)
 class Run:
-    """What a forked run came to.
-
-    Attributes:
-        code: exit code; negative = the signal that ended it; None = it did not end in time.
-        lines: what it printed.
-        calls: the counted calls, in order.
-        other: the run that was started while this one stood still.
-    """
+    """What a forked run came to."""
 
     code: int | None
+    """Negative = the signal that ended it; None = it did not end in time."""
     lines: tuple[str, ...]
     calls: tuple[Call, ...]
     seconds: float
     other: "Run | None" = None
+    """The run that was started while this one stood still."""
 
     @property
     def error(self) -> str:
@@ -107,14 +92,11 @@ class FaultServer:
         )  # fmt: skip
 
     def _ask(self, asked: dict[str, Any]) -> dict[str, Any]:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         print(json.dumps(asked), file=self._process.stdin, flush=True)
         line = self._process.stdout.readline()
         if not line:
             raise RuntimeError(f"the server ended: {Path(self._log.name).read_text()[-3000:]}")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
+        return json.loads(line)
 
     def prepare(self, name: str) -> None:
         """Makes the inputs of a case."""
@@ -135,13 +117,10 @@ class FaultServer:
         """Runs a command line in a child.
 
         Args:
-            words: of the command.
             folder: where it runs; changes below it are counted.
             at: the number of the call at which the fault is; 0 = none.
-            action: what the fault is.
             reads: a folder whose files are counted as inputs as they are opened; changes are not counted then.
             warm: whether to run it in the server itself, so that children have its modules and kernels.
-            environment: changes to that of the server.
             meanwhile: a command line that is run while this one stands still (`HALT`). Where it waits for this one,
                 this one goes on after some seconds.
         """
@@ -170,11 +149,9 @@ class FaultServer:
 
     def close(self) -> None:
         """Ends the server."""
-        assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait(30)
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        self._process.stdout.close()
         self._log.close()
 
 

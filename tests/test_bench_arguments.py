@@ -62,15 +62,7 @@ def test_no_script_of_bench_hides_a_module_of_python_or_of_a_package() -> None:
         ("mix.py", ["HOUSE", "OUT", "--names", "zzz"], "train_000, train_001"),
     ],
 )
-def test_a_wrong_argument_is_refused_in_one_line(
-    house: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-    script: str,
-    words: list[str],
-    expected: str,
-) -> None:
+def test_a_wrong_argument_is_refused_in_one_line(house, tmp_path, monkeypatch, capfd, script, words, expected):
     paths = {"HOUSE": house, "OUT": tmp_path / "out", "GONE": tmp_path / "gone"}
     message = refusal(monkeypatch, capfd, script, *(paths.get(word, word) for word in words))
     assert expected.replace("HOUSE", str(house)) in message

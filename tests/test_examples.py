@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from field_scenes import FieldRoom, write_transforms
+from field_scenes import write_transforms
 from PIL import Image
 
 import gsencoder
@@ -62,9 +62,7 @@ def test_an_example_fuses_and_localizes(room: Path, tmp_path: Path) -> None:
     assert size_of(tmp_path / "relevancy.png") == (240, 90)
 
 
-def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(
-    run: Callable[..., str], room: Path, tmp_path: Path
-) -> None:
+def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(run, room, tmp_path):
     out = run(2, room)
     left, right = (float(number) for number in re.findall(r"= (-?[\d.]+)", out)[:2])
     assert left == pytest.approx(right, rel=1e-3, abs=0.5)
@@ -72,9 +70,7 @@ def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(
     assert size_of(tmp_path / "patches.png") == (240, 90)
 
 
-def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(
-    run: Callable[..., str], room: Path, tmp_path: Path
-) -> None:
+def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(run, room, tmp_path):
     out = run(3, room, "table,chair")
     assert re.search(r"^[\d,]+ features of ", out)
     assert re.findall(r"^(table|chair): \d+ boxes", out, re.MULTILINE) == ["table", "chair"]
@@ -92,9 +88,7 @@ def test_an_example_renders_views_of_a_target(run: Callable[..., str], room: Pat
     assert re.match(r"view_00\.png: .*, shows \d+% of red", out)
 
 
-def test_the_first_commands_of_the_readme_need_nothing_but_gsencoder(
-    field_room: FieldRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_first_commands_of_the_readme_need_nothing_but_gsencoder(field_room, tmp_path, monkeypatch, capsys):
     """Each `fuse` and `localize` of a labeled room, and of photographs with a splat."""
     monkeypatch.delenv("GSENCODER_MODELS", raising=False)
     # Embedding all of them takes seconds.

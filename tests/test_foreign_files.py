@@ -73,21 +73,17 @@ def test_links_to_files_are_read_and_large_files_are_not(tmp_path):
     for refuse in (read_foreign, read_foreign_text, open_foreign, check_foreign):
         with pytest.raises(InputError, match="7 bytes; at most 6"):
             refuse(tmp_path / "link", 6)
+    with (tmp_path / "large").open("wb") as stream:
+        stream.truncate(TEXT_BYTES + 1)
+    with pytest.raises(InputError, match="at most 268,435,456 are read"):
+        read_foreign_text(tmp_path / "large")
     with pytest.raises(InputError, match="is a folder"):
         open_foreign(tmp_path)
     with pytest.raises(FileNotFoundError):
         open_foreign(tmp_path / "missing")
 
 
-@pytest.mark.parametrize("read", [read_foreign, read_foreign_text])
-def test_a_text_of_gigabytes_is_refused_where_no_limit_is_named(tmp_path, read):
-    with (tmp_path / "file").open("wb") as stream:
-        stream.truncate(TEXT_BYTES + 1)
-    with pytest.raises(InputError, match="at most 268,435,456 are read"):
-        read(tmp_path / "file")
-
-
-@pytest.mark.parametrize("kind", ["pipe", "device", "dangling"])
+@pytest.mark.parametrize("kind", ["pipe", "dangling"])
 def test_truth_of_a_scene_that_cannot_be_read_is_named_and_not_left_out(tmp_path, kind):
     for folder in ("predictions", "truth"):
         (tmp_path / folder).mkdir()

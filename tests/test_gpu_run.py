@@ -27,9 +27,7 @@ def run(script: dict[str, Any], monkeypatch: pytest.MonkeyPatch, out: Path, *wor
 
 
 @pytest.mark.slow
-def test_every_part_is_well_on_a_cpu_or_says_why_it_is_skipped(
-    script: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_part_is_well_on_a_cpu_or_says_why_it_is_skipped(script, tmp_path, monkeypatch):
     code, parts = run(script, monkeypatch, tmp_path / "gpu.md")
     states = {each["part"]: each["state"] for each in parts}
     assert list(states) == list(script["PARTS"])
@@ -41,9 +39,7 @@ def test_every_part_is_well_on_a_cpu_or_says_why_it_is_skipped(
     assert all(f"| {name} |" in report for name in states)
 
 
-def test_a_part_that_raises_is_reported_and_hides_no_other(
-    script: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_that_raises_is_reported_and_hides_no_other(script, tmp_path, monkeypatch):
     def broken(setting: Any) -> list[Any]:
         raise ValueError("a kernel | was lost\nin two lines")
 

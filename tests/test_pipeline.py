@@ -137,18 +137,14 @@ def test_a_room_a_million_metres_away_gives_the_same_boxes_there(demo: Path, tmp
     np.testing.assert_allclose(corners[1] - shift, corners[0], atol=0.01)
 
 
-def test_a_word_outside_the_table_is_refused_with_the_near_ones(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_word_outside_the_table_is_refused_with_the_near_ones(demo, tmp_path, capsys):
     line = refusal(capsys, "localize", str(demo / "colors"), "query=purpel", f"out={tmp_path / 'boxes'}")
     assert "purpel" in line
     assert "purple" in line
     assert not (tmp_path / "boxes").exists()
 
 
-def test_features_beside_another_splat_are_refused(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_features_beside_another_splat_are_refused(demo, tmp_path, capsys):
     mixed = tmp_path / "mixed"
     shutil.copytree(demo / "names", mixed)
     assert cli.main(["demo", f"out={tmp_path / 'other'}", "views=2", "width=48", "objects=6", "quiet=true"]) == 0

@@ -59,9 +59,7 @@ def encoded(rooms: Path, trained: Path) -> Path:
     return out
 
 
-def test_training_leaves_one_encoder_with_the_spaces_words_and_scores_of_both_teachers(
-    rooms: Path, trained: Path
-) -> None:
+def test_training_leaves_one_encoder_with_the_spaces_words_and_scores_of_both_teachers(rooms, trained):
     summary = json.loads((trained / "summary.json").read_text())
     assert any("teacher labels: 1 of 3 scenes lack" in str(warning) for warning in summary["warnings"])
     results = summary["results"]
@@ -116,9 +114,7 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named
     assert "holds words of room-words, which lead into these features" in lost
 
 
-def test_words_are_asked_of_the_space_that_is_named(
-    encoded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_words_are_asked_of_the_space_that_is_named(encoded, tmp_path, capsys):
     colors = ["localize", str(encoded), "query=red", "pictures=0", "localize.min_probability=0"]
     assert cli.main([*colors, "space=palette", f"out={tmp_path / 'red'}", "quiet=true"]) == 0
     line = refusal(capsys, *colors, f"out={tmp_path / 'any'}")
@@ -143,9 +139,7 @@ def test_evaluation_takes_the_space_of_the_words(rooms: Path, trained: Path, tmp
     assert results_of(tmp_path / "again")["names"] == results_of(tmp_path / "scores")["names"]
 
 
-def test_fusing_in_the_basis_of_one_of_several_teachers_needs_a_teacher_of_its_space(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fusing_in_the_basis_of_one_of_several_teachers_needs_a_teacher_of_its_space(rooms, trained, tmp_path, capsys):
     line = refusal(
         capsys,
         *["fuse", str(rooms / "room_2"), "teacher=palette", f"basis={trained}", f"out={tmp_path / 'fused'}"],
@@ -174,14 +168,11 @@ def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pyt
     for more, message in (
         (["teacher=[labels,colors]"], "teachers: expected some of"),
         (["teacher=[palette,palette]"], "palette is given twice; give other names, such as palette_2:palette"),
-        (["teacher=[palette,p/2:palette]"], "expected names of letters, digits and _, got 'p/2'"),
         (["teacher=[palette,labels]", "teachers.radio.size=3"], "teachers.radio.size: there is no radio among"),
-        (["teacher=[palette,labels]", "teachers.labels.size=3"], "and labels is teacher=labels"),
         (["teacher=[palette,labels]", words, "loss.teacher_weights=[1.0]"], "loss.teacher_weights: expected 2 numbers"),
         (["teacher=[palette,other:palette]"], "teachers: palette and other have the same features"),
         (["teacher=[palette,labels]", "teacher.words=x"], "teacher.words: is for a single teacher, and teachers="),
         (["teachers=palette,labels", "teacher=radio"], "leave out teacher= or teachers="),
-        (["teacher=[]"], "teachers: expected one or more of"),
         (["teacher=[palette,x:onnx]"], "teachers.x.model= is missing"),
     ):
         assert message in refusal(capsys, *train, *more), more

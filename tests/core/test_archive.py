@@ -46,9 +46,7 @@ def test_arrays_and_header_come_back(tmp_path: Path) -> None:
         ({**ARRAYS, "b": np.array([0, np.nan, np.inf], np.float32)}, "2 of 3 values of b are not finite"),
     ],
 )
-def test_an_array_that_is_not_as_asked_is_named_with_its_file(
-    tmp_path: Path, arrays: dict[str, np.ndarray], problem: str
-) -> None:
+def test_an_array_that_is_not_as_asked_is_named_with_its_file(tmp_path, arrays, problem):
     write_archive(tmp_path / "x", arrays, {"name": "n"})
     with pytest.raises(InputError, match=f"{tmp_path / 'x'}: .*{problem}"):
         taken(tmp_path / "x")
@@ -150,9 +148,7 @@ def test_a_flip_is_seen_by_whoever_reads_its_block_and_by_nobody_else(mapped: Pa
         open_mapped(mapped).array(name)
 
 
-def test_what_was_checked_is_remembered_until_the_file_is_written_again(
-    mapped: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_checked_is_remembered_until_the_file_is_written_again(mapped, monkeypatch):
     import gsencoder.core.archive as checksums
 
     looked_at: list[int] = []

@@ -122,9 +122,7 @@ def test_pictures_are_written_in_the_format_of_their_suffix(name: str, tmp_path:
         (OSError(errno.EIO, os.strerror(errno.EIO)), "a: cannot write: Input/output error"),
     ],
 )
-def test_what_the_system_refuses_is_told_from_a_target_that_cannot_be(
-    tmp_path: Path, fault: OSError, message: str
-) -> None:
+def test_what_the_system_refuses_is_told_from_a_target_that_cannot_be(tmp_path, fault, message):
     write_bytes(tmp_path / "a", b"earlier")
     with pytest.raises(WriteError, match=message), atomic_file(tmp_path / "a"):
         raise fault

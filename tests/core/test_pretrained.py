@@ -73,9 +73,7 @@ def test_weights_are_those_of_the_configuration_or_refused(bert: Path, settings:
 
 
 @pytest.mark.parametrize("ignored", [(), ("classifier",), ANY])
-def test_weights_of_other_parts_are_left_out_with_a_warning_unless_they_are_expected(
-    bert: Path, ignored: tuple[str, ...]
-) -> None:
+def test_weights_of_other_parts_are_left_out_with_a_warning_unless_they_are_expected(bert, ignored):
     import transformers
 
     with warnings.catch_warnings(record=True) as caught:
@@ -87,9 +85,7 @@ def test_weights_of_other_parts_are_left_out_with_a_warning_unless_they_are_expe
     assert all("weights that are no part of the backbone are not used: classifier" in each for each in messages)
 
 
-def test_the_fingerprint_is_that_of_settings_and_files_in_their_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_fingerprint_is_that_of_settings_and_files_in_their_order(tmp_path, monkeypatch):
     first, second = tmp_path / "first", tmp_path / "second"
     first.write_bytes(b"0123456789")
     second.write_bytes(b"abc")

@@ -105,9 +105,7 @@ def test_steps_of_several_threads_share_the_seconds_of_the_wall_clock() -> None:
 
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize(("amx", "avx"), [(False, False), (False, True), (True, True)])
-def test_automatic_precision_is_bfloat16_only_where_the_processor_multiplies_it(
-    monkeypatch: pytest.MonkeyPatch, training: bool, amx: bool, avx: bool
-) -> None:
+def test_automatic_precision_is_bfloat16_only_where_the_processor_multiplies_it(monkeypatch, training, amx, avx):
     monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: avx)
     expected = torch.bfloat16 if amx or (avx and not training) else None

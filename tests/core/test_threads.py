@@ -65,9 +65,7 @@ def test_of_several_errors_the_one_of_the_first_piece_is_raised_and_no_more_piec
     assert parallel(lambda piece: piece, range(3)) == [0, 1, 2]
 
 
-def test_where_the_caller_is_interrupted_no_more_pieces_begin_and_none_runs_on(
-    two_threads: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_the_caller_is_interrupted_no_more_pieces_begin_and_none_runs_on(two_threads, monkeypatch):
     working, waited_for = threading.Event(), threading.Event()
     begun, ended = list[int](), list[int]()
     one_thread, join = threads._one_thread, threads._join
@@ -116,9 +114,7 @@ def test_work_ahead_comes_in_order_and_one_item_before_it_is_asked_for() -> None
 
 
 @pytest.mark.parametrize(("threads", "workers", "share"), [(4, 2, 2), (2, 2, 1), (1, 3, 1)])
-def test_workers_ahead_share_the_threads_and_give_results_in_order(
-    threads: int, workers: int, share: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_ahead_share_the_threads_and_give_results_in_order(threads, workers, share, monkeypatch):
     monkeypatch.setattr("gsencoder.core.threads.thread_count", lambda: threads)
     together = threading.Barrier(workers)
 
@@ -145,9 +141,7 @@ def test_without_torch_there_are_as_many_threads_as_the_environment_says(stated:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_where_nothing_can_be_stored_kernels_are_compiled_anew_with_one_warning(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_where_nothing_can_be_stored_kernels_are_compiled_anew_with_one_warning(monkeypatch):
     import numba
 
     def njit(*, cache: bool = False, **_: object) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -82,9 +82,7 @@ def outcomes(ranks: RankServer, folder: Path, *hows: str) -> dict[str, list[str]
 
 
 @pytest.mark.alone
-def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_waited_for(
-    tmp_path: Path, ranks: RankServer
-) -> None:
+def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_waited_for(tmp_path, ranks):
     messages = outcomes(ranks, tmp_path, "settings", "weights", "settings of training", "hangs")
     for how, what, advice in (
         ("settings", "the settings differ", "give all processes the same command"),

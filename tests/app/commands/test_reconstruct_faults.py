@@ -17,9 +17,7 @@ from gsencoder.reconstruct import run as reconstruct
 pytestmark = pytest.mark.slow
 
 
-def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(
-    room: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(room, built, tmp_path, monkeypatch):
     out, score, calls = tmp_path / "out", fit.score, []
 
     def cut_off_at_the_last(*arguments: object) -> object:
@@ -39,9 +37,7 @@ def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(
     assert steps == ["step", "0", "12"]
 
 
-def test_results_that_cannot_be_written_cost_no_step(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_that_cannot_be_written_cost_no_step(room, tmp_path, monkeypatch, capsys):
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -53,17 +49,13 @@ def test_results_that_cannot_be_written_cost_no_step(
     assert cli.main(["reconstruct", *words]) == 0
 
 
-def test_settings_that_cannot_work_leave_no_state_that_others_stumble_over(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_that_cannot_work_leave_no_state_that_others_stumble_over(room, tmp_path, capsys):
     words = [str(room), f"out={tmp_path / 'out'}", *QUICK]
     assert "is raster.near small enough?" in refusal(capsys, *words, "raster.near=1e9")
     assert cli.main(["reconstruct", *words]) == 0
 
 
-def test_photographs_that_are_masked_all_over_are_not_fitted(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_photographs_that_are_masked_all_over_are_not_fitted(room, tmp_path, capsys):
     from PIL import Image
 
     scene = shutil.copytree(room, tmp_path / "scene")
@@ -84,9 +76,7 @@ def _floor(folder: Path) -> Path:
     return path
 
 
-def test_a_disk_without_room_for_the_database_is_told_before_it_fills(
-    ten: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_disk_without_room_for_the_database_is_told_before_it_fills(ten, tmp_path, monkeypatch, capsys):
     room_left = shutil.disk_usage(tmp_path)._replace(free=1 << 20)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: room_left)
     problem = refusal(capsys, str(ten), f"out={tmp_path / 'out'}", "quiet=true")
