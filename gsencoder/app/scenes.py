@@ -87,9 +87,9 @@ def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextCon
     that is not given is searched for when a phrase needs it."""
     if words_file:
         words = words_of_table(load_text_table(find_file(words_file, "words")), text)
-        return with_training_names(words, _table_beside(folder, space))
+        return with_training_names(words, _find_table(folder, space))
     if not isinstance(text, TableTextConfig):
-        table = _table_beside(folder, space)
+        table = _find_table(folder, space)
         return vocabulary_of(text) if table is None else words_of_table(table, text)
     path = table_path(folder, space.text_encoder)
     if path is None:
@@ -100,7 +100,7 @@ def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextCon
     return words_of_table(load_text_table(path))
 
 
-def _table_beside(folder: Path, space: FeatureSpace) -> TextTable | None:
+def _find_table(folder: Path, space: FeatureSpace) -> TextTable | None:
     """The table of a space in a folder of features; None where it is lost, damaged or of another space, for which
     words= and text= stand in."""
     try:

@@ -76,6 +76,16 @@ def text_encoder_of(words: Words | None) -> str:
     return "" if words is None else words.space.text_encoder
 
 
+def settings_of(space: FeatureSpace) -> dict[str, Any]:
+    """The settings of a teacher whose feature space states all that its maps depend on."""
+    return {
+        "name": space.teacher,
+        "model": space.weights,
+        "layer": space.layer,
+        "preprocessing": space.preprocessing,
+    }
+
+
 def check_channels(space: FeatureSpace, words: Words | None) -> None:
     """Refuses words of another width than a teacher's features."""
     if words is not None and words.space.channels != space.channels:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, renamed_options
@@ -89,12 +88,6 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
 
 def load_teacher_heads(config: TeacherConfig, names: Sequence[str], option: str = "heads") -> list[Any]:
     """Adapter heads (`gsencoder.teachers.heads.Head`) of a teacher, by names that `option` gives."""
-    for name in names:
-        if name.endswith((".safetensors", ".onnx")) or "/" in name or Path(name).is_file():
-            raise InputError(
-                f"{option}={name}: expected names of the teacher's adapter heads, such as siglip or sam.features; "
-                "they are read from the folder of teacher.model="
-            )
     if not names:
         return []
     if not config.has_heads:

@@ -48,7 +48,7 @@ class LabelsConfig(TeacherSettings):
         if not self.words:
             raise InputError("words: the labels teacher needs a text table of its names")
 
-    def build(self, scene: Scene, words: Words | None) -> Teacher:
+    def build(self, scene: Scene, words: Words | None) -> "LabelsTeacher":
         assert words is not None
         if isinstance(words, OpenVocabulary):
             words = words.including(sorted({o.name for o in scene.objects if o.name is not None}))

@@ -17,7 +17,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import digest_files, open_session
 from gsencoder.core.settings import check_limits, option
-from gsencoder.teachers.base import MissingInput
+from gsencoder.teachers.base import MissingInput, settings_of
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 LARGEST_SIDE = 8192
@@ -93,6 +93,10 @@ class PictureTeacher:
         features, grid_from_image = self.cells(photograph(views, view, self.subject))
         check_finite(features, f"{self.subject}: view {views.names[view]!r}", self.advice)
         return FeatureMap(features=features, grid_from_image=grid_from_image, space=self.space)
+
+    def settings(self) -> dict[str, Any]:
+        """All but the views that the maps depend on, as JSON values."""
+        return settings_of(self.space)
 
 
 def check_finite(values: Float32[np.ndarray, "..."], subject: str, advice: str) -> None:
@@ -223,26 +227,22 @@ def read_preprocessing(folder: Path, subject: str, *, floats: bool = False) -> P
     since features of pictures that were normalized otherwise look plausible, and are wrong.
     """
     path, stated = _stated(folder, subject)
-    where = f"{subject}: {path}"
-    missing = [name for name in ("resample", "image_mean", "image_std") if name not in stated]
-    if missing:
-        raise InputError(f"{where} does not state {', '.join(missing)}; take the file that belongs to the model")
-    if type(stated["resample"]) is not int or not 0 <= stated["resample"] <= 5:
-        raise InputError(f"{where}: resample: expected a number from 0 to 5, got {stated['resample']!r}")
-    resample = Image.Resampling(stated["resample"])
+    try:
+        resample = Image.Resampling(stated["resample"])
+        mean, std = ([float(value) for value in stated[name]] for name in ("image_mean", "image_std"))
+        factor = float(stated.get("rescale_factor", 1 / 255)) if stated.get("do_rescale", True) else 1.0
+        if len(mean) != 3 or len(std) != 3 or not np.isfinite([*mean, *std, factor]).all() or min(*std, factor) <= 0:
+            raise ValueError("numbers out of range")
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{subject}: {path}: expected a filter of Pillow as resample, three numbers as image_mean, three above 0 "
+            f"as image_std, and a rescale_factor above 0 ({error}); take the file that belongs to the model"
+        ) from error
     if floats and resample not in FLOAT_FILTERS:
-        raise InputError(f"{where}: resample: expected 2 (bilinear) or 3 (bicubic), got {int(resample)}")
-    normalizes = stated.get("do_normalize", True)
-    factor = stated.get("rescale_factor", 1 / 255) if stated.get("do_rescale", True) else 1.0
-    if not _is_number(factor) or factor <= 0:
-        raise InputError(f"{where}: rescale_factor: expected a number above 0, got {factor!r}")
-    return Preprocessing(
-        resample=resample,
-        factor=float(factor),
-        mean=_three(stated["image_mean"], f"{where}: image_mean") if normalizes else (0.0, 0.0, 0.0),
-        std=_three(stated["image_std"], f"{where}: image_std", positive=True) if normalizes else (1.0, 1.0, 1.0),
-        floats=floats,
-    )
+        raise InputError(f"{subject}: {path}: resample: expected 2 (bilinear) or 3 (bicubic), got {int(resample)}")
+    if not stated.get("do_normalize", True):
+        mean, std = [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
+    return Preprocessing(resample=resample, factor=factor, mean=tuple(mean), std=tuple(std), floats=floats)
 
 
 def _stated(folder: Path, subject: str) -> tuple[Path, dict[str, Any]]:
@@ -261,18 +261,6 @@ def _stated(folder: Path, subject: str) -> tuple[Path, dict[str, Any]]:
         f"{subject}: {folder} has no preprocessor_config.json, which says how its pictures are resized and normalized; "
         "take the file that belongs to the model"
     )
-
-
-def _three(value: Any, where: str, *, positive: bool = False) -> tuple[float, ...]:
-    numbers = value if isinstance(value, list) else []
-    if len(numbers) != 3 or not all(_is_number(number) and (number > 0 or not positive) for number in numbers):
-        expected = "three numbers above 0" if positive else "three numbers"
-        raise InputError(f"{where}: expected {expected}, one a channel, got {str(value)[:60]}")
-    return tuple(float(number) for number in numbers)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 class TorchTeacher(PictureTeacher):

@@ -103,21 +103,17 @@ class RadioTeacher(TorchTeacher):
         """Loads the model from its folder; nothing is fetched from anywhere."""
         folder = radio_folder(config)
         check_radio(folder)
-        self.device, self.size, self.config = choose_device(config.device).type, config.size, config
+        self.device, self.size = choose_device(config.device).type, config.size
         self.network = network = RadioNetwork(folder).to(self.device)
-        self._digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("config.json")]))
         self.space = FeatureSpace(
             name=f"radio-{folder.resolve().name}",
             channels=network.channels,
             teacher="radio",
-            weights=self._digest,
+            weights=digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("config.json")])),
             layer="features",
             preprocessing=f"resized to {config.size} px in multiples of {network.patch}",
             text_encoder=text_encoder,
         )
-
-    def settings(self) -> dict[str, Any]:
-        return {"name": "radio", "model": self._digest, "size": self.config.size}
 
 
 def radio_folder(config: RadioConfig) -> Path:
@@ -223,10 +219,10 @@ def _version(args: Mapping[str, Any], part: Part) -> str:
     if part == "features" and args.get("spatial_mlp_version"):
         option = "spatial_mlp_version"
     version = args.get(option)
-    if version == "attn":
-        raise InputError(f"is an attention head (args.{option}=attn), which is not supported; expected v1 or v2")
     if version not in VERSIONS:
-        raise InputError(f"is a head of an unknown form (args.{option}={str(version)[:20]}); expected v1 or v2")
+        raise InputError(
+            f"is a head of form {str(version)[:20]} (args.{option}), which is not supported; expected v1 or v2"
+        )
     return str(version)
 
 

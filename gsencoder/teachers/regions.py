@@ -27,7 +27,7 @@ from gsencoder.core.pretrained import (
 from gsencoder.core.process import Device
 from gsencoder.core.settings import option
 from gsencoder.data.readers.transforms_json import read_json
-from gsencoder.teachers.base import MissingInput, Teacher, TeacherSettings, check_channels, text_encoder_of
+from gsencoder.teachers.base import MissingInput, Teacher, TeacherSettings, check_channels, settings_of, text_encoder_of
 from gsencoder.teachers.labels import codes_of
 from gsencoder.teachers.masks import (
     WHAT,
@@ -529,13 +529,7 @@ class CropVectors:
         return (vector / length).astype(np.float32)
 
     def settings(self) -> dict[str, Any]:
-        return {
-            "vector": "crop",
-            "model": self.tower.digest,
-            "preprocessing": self.tower.preprocessing,
-            "around": self._around,
-            "text_encoder": self.space.text_encoder,
-        }
+        return settings_of(self.space)
 
 
 def square_crop(

@@ -217,18 +217,6 @@ class TransformersTeacher(TorchTeacher):
         out: Tensor = network(pixels)
         return out
 
-    def settings(self) -> dict[str, Any]:
-        values: dict[str, Any] = {
-            "name": "transformers",
-            "model": self.network.digest,
-            "dense": self.network.dense,
-            "layer": self.config.layer,
-            "size": self.size,
-            "preprocessing": self.preprocessing.describe(),
-            "large": self.config.large,
-        }
-        return {**values, "overlap": self.config.overlap} if self.config.large == "windows" else values
-
 
 Dense = Literal["tokens", "values", "summary"]
 """What the vectors of patches are; see `VisionTower`."""

@@ -308,7 +308,7 @@ def test_folders_of_other_models_are_refused(saved: Any, tmp_path: Path) -> None
         masks_of(tmp_path / "vit")
     folder, _ = saved(sam2)
     (folder / "preprocessor_config.json").write_text(json.dumps({"image_mean": [0.5]}))
-    with pytest.raises(InputError, match="does not state resample, image_std"):
+    with pytest.raises(InputError, match="expected a filter of Pillow as resample"):
         masks_of(folder)
     (folder / "preprocessor_config.json").write_text(
         json.dumps({"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "resample": 2})

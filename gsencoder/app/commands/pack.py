@@ -92,11 +92,11 @@ def run(config: PackConfig, run: Run) -> None:
             if words is not None:
                 save_text_table(folder / WORDS_FILE, words, dtype="float16" if config.form in CODED else "float32")
         else:
-            _write_beside(folder, source, scene, features, config.form)
+            _write_sidecars(folder, source, scene, features, config.form)
     run.print(f"{out}: {message}")
 
 
-def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFeatures, form: Form) -> None:
+def _write_sidecars(folder: Path, source: Path, scene: Scene, features: GaussianFeatures, form: Form) -> None:
     """Writes the words and the adapter heads of the features that lie beside them."""
     words = table_path(source, features.space.text_encoder)
     if words is not None and form in CODED:

@@ -18,7 +18,6 @@ from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protoc
 from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.fuse import fuse
-from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -57,8 +56,7 @@ class NamingBenchmark(Benchmark[NamingCounts]):
                 f"naming: the features are of the space ({features.space.describe()}), but the words of "
                 f"({words.space.describe()}); give words of the features' space"
             )
-        teacher = build_teacher(LabelsConfig(), scene, words)
-        assert isinstance(teacher, LabelsTeacher)
+        teacher = LabelsConfig().build(scene, words)
         return compare_names(fuse(scene, teacher, self.evaluation.fusion).features, features, teacher)
 
     def report(self, results: Sequence[SceneResult[NamingCounts]]) -> ScoreReport:

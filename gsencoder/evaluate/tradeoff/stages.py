@@ -351,8 +351,7 @@ def open_encoder(inputs: Inputs, path: Path) -> Iterator[Opened]:
         if not tables:
             raise InputError(f"{weights}: no words lie beside the encoder, so that nothing names what it says")
         space, words = next(iter(tables.items()))
-        teacher = build_teacher(LabelsConfig(), scene, words)
-        assert isinstance(teacher, LabelsTeacher)
+        teacher = LabelsConfig().build(scene, words)
         return space, words, teacher, fuse(scene, teacher, inputs.fusion).features
 
     def run(settings: EncoderSettings) -> GaussianFeatures:
