@@ -53,6 +53,10 @@ SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.5
 """Of 1 − SSIM, where the rest of 1 is L1's; of the relative error of depth, where a sensor measured it."""
 
 
+EMPTY_WEIGHT = 0.5
+"""Of the opacity where transparency, or a background of one color, says that nothing is there."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimizeConfig:
     """Settings of the optimization of a splat."""
@@ -63,9 +67,6 @@ class OptimizeConfig:
         (2, 1), "factors by which photographs are made smaller, one stage after the other", ge=1
     )
     shares: tuple[float, ...] = option((0.3, 0.7), "share of the steps of each of these stages")
-    empty_weight: float = option(
-        0.5, "of the opacity where transparency, or a background of one color, says that nothing is there", ge=0, le=100
-    )
     anchor_sigmas: float = option(
         0.4,
         "Gaussians that begin on a measured surface (depth, mesh, tsdf) stay within about this many of their "
@@ -107,7 +108,7 @@ def losses_of(
     *,
     ssim_weight: float = SSIM_WEIGHT,
     depth_weight: float = DEPTH_WEIGHT,
-    empty_weight: float = 0.0,
+    empty_weight: float = EMPTY_WEIGHT,
 ) -> dict[str, Float[Tensor, ""]]:
     """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, the relative error of depth where it is known, and the
     opacity where the photograph shows that nothing is there, per pixel of the mask. `ssim_weight` is λ.
@@ -145,15 +146,19 @@ def losses_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PruneConfig:
-    """What is taken out, and when."""
+    """What is taken out, and when.
 
-    at: tuple[float, ...] = option((0.3, 0.6, 0.9), "shares of the steps after which is pruned", gt=0, le=1)
-    opacity: float = option(0.005, "opacities below are taken out", ge=0)
-    screen: float = option(1.0, "wider than this many times the picture's longer side in some view", ge=0)
-    contribution: float = option(0.1, "less than this many pixels' worth in every photograph, at its full size", ge=0)
+    Attributes:
+        at: shares of the steps after which is pruned.
+        opacity: lower ones are taken out.
+        screen: wider than this many times the picture's longer side in some view; 0 = any.
+        contribution: less than this many pixels' worth in every photograph, at its full size.
+    """
 
-    def __post_init__(self) -> None:
-        check_limits(self)
+    at: tuple[float, ...] = (0.3, 0.6, 0.9)
+    opacity: float = 0.005
+    screen: float = 1.0
+    contribution: float = 0.1
 
     def due(self, step: int, schedule: OptimizeConfig) -> bool:
         """Whether the splat is pruned after `step` steps; small shares are of the first step."""
@@ -203,11 +208,9 @@ def rows_to_keep(
     rows_left = (~torch.stack([*rejected.values()]).any(dim=0)).nonzero().squeeze(1)
     if not len(rows_left):
         why = ", ".join(
-            f"{int(rows.sum())} by prune.{name}={getattr(config, name):g}"
-            for name, rows in rejected.items()
-            if rows.any()
+            f"{int(rows.sum())} by {name} {getattr(config, name):g}" for name, rows in rejected.items() if rows.any()
         )
-        raise InputError(f"reconstruct: pruning would leave none of {len(means)} Gaussians ({why}); change these")
+        raise InputError(f"reconstruct: pruning would leave none of {len(means)} Gaussians ({why})")
     if most is not None and len(rows_left) > most:
         by_contribution = contributions[rows_left].argsort(descending=True, stable=True)
         rows_left = rows_left[by_contribution[:most]].sort().values
@@ -264,7 +267,7 @@ class Optimizer:
         training: Sequence[int],
         config: OptimizeConfig,
         *,
-        prune: PruneConfig,
+        prune: PruneConfig = PruneConfig(),
         raster: RasterConfig = RasterConfig(),
         anchor: Anchor | None = None,
         exposures: Tensor | None = None,
@@ -340,7 +343,7 @@ class Optimizer:
         if self.exposures is not None:
             colors = self.exposures.moved(view, self._fitted_colors(raster, photo))
             raster = raster._replace(rgb=apply_colors(raster.rgb, self.exposures.relative(view, colors)))
-        losses = losses_of(raster, photo, empty_weight=self.config.empty_weight)
+        losses = losses_of(raster, photo, empty_weight=EMPTY_WEIGHT)
         total = torch.stack([*losses.values()]).sum()
         total.backward()
         grads = {name: value.grad for name, value in leaves.items() if value.grad is not None}

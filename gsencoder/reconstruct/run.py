@@ -31,7 +31,7 @@ from gsencoder.data.seeding.from_photographs import (
 )
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
 from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import (
     CHECKPOINT_FILE,
     PLAN,
@@ -74,7 +74,6 @@ class ReconstructConfig:
     dense: DenseConfig = field(default_factory=DenseConfig)
     optimize: OptimizeConfig = field(default_factory=OptimizeConfig)
     budget: ReconstructBudget = field(default_factory=ReconstructBudget)
-    prune: PruneConfig = field(default_factory=PruneConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
 
     def __post_init__(self) -> None:
@@ -83,11 +82,10 @@ class ReconstructConfig:
             raise InputError("holdout: expected 0 (none) or 2 and more, got 1")
         of_steps = replace(self.budget, megabytes=None)
         reject_options_set_by_budget(of_steps, self.optimize, OptimizeConfig(), ("steps",), "optimize")
-        if self.budget.megabytes is not None and not (self.prune.at and self.optimize.steps):
-            never = "optimize.steps=0" if self.prune.at else "prune.at=[]"
+        if self.budget.megabytes is not None and not self.optimize.steps:
             raise InputError(
-                f"budget.megabytes: Gaussians that do not fit are taken out as the splat is pruned, and {never} "
-                "never prunes; leave one of the two out"
+                "budget.megabytes: Gaussians that do not fit are taken out as the splat is pruned, and "
+                "optimize.steps=0 never prunes; leave one of the two out"
             )
 
     def validates_at(self, step: int, steps: int) -> bool:
@@ -96,7 +94,7 @@ class ReconstructConfig:
 
     def identity(self) -> dict[str, Any]:
         """The settings that an interrupted run must share with the run that continues it, as JSON values."""
-        names = ("seeds", "dense", "optimize", "budget", "prune", "raster", "holdout")
+        names = ("seeds", "dense", "optimize", "budget", "raster", "holdout")
         return {name: plain(getattr(self, name)) for name in names}
 
 
@@ -340,7 +338,6 @@ def reconstruct(
             photographs,
             training,
             config.optimize,
-            prune=config.prune,
             raster=config.raster,
             anchor=state.anchor,
             exposures=state.exposures,

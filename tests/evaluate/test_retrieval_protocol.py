@@ -15,7 +15,7 @@ from rooms import room
 
 from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.benchmarks.retrieval import RetrievalProtocol, score_views
+from gsencoder.evaluate.benchmarks.retrieval import STRIDE, RetrievalProtocol, score_views
 from gsencoder.infer.relevancy import word_directions
 from gsencoder.memory.attention import render_queries
 from gsencoder.render import blend
@@ -42,14 +42,14 @@ def test_scores_are_pooled_cosines_of_rendered_pixels(pooling: Any, mode: Any) -
     scene, features = featured()
     assert scene.gaussians is not None
     assert scene.views is not None
-    protocol = RetrievalProtocol(stride=2, pooling=pooling, mode=mode)
+    protocol = RetrievalProtocol(pooling=pooling, mode=mode)
     text_mean = TEXTS.mean(axis=0)
     directions = word_directions(TEXTS, text_mean, mode)
     views = [2, 0]
     scores = score_views(scene, features, views, directions, protocol)
     assert scores.shape == (2, 70)
     for row, view in enumerate(views):
-        b = blend(scene.gaussians, scene.views.cameras, view, stride=2)
+        b = blend(scene.gaussians, scene.views.cameras, view, stride=STRIDE)
         rendered = b.render(torch.from_numpy(features.features)).numpy().astype(np.float64)
         alpha = b.alpha.numpy().astype(np.float64)
         pixels = rendered[alpha > 0] / alpha[alpha > 0, None] - (features.mean if mode == "centered" else 0)
@@ -77,9 +77,9 @@ def test_a_memory_is_scored_by_what_pixels_attend_to() -> None:
     assert scene.gaussians is not None
     assert scene.views is not None
     directions = word_directions(TEXTS, TEXTS.mean(axis=0), "raw")
-    protocol = RetrievalProtocol(stride=2, mode="raw", pooling="mean")
+    protocol = RetrievalProtocol(mode="raw", pooling="mean")
     (scores,) = score_views(scene, features, [1], directions, protocol, memory=memory)
-    queries, alpha = render_queries(memory, blend(scene.gaussians, scene.views.cameras, 1, stride=2))
+    queries, alpha = render_queries(memory, blend(scene.gaussians, scene.views.cameras, 1, stride=STRIDE))
     pixels = memory.attend(queries[alpha > 0]).astype(np.float64)
     units = pixels / np.linalg.norm(pixels, axis=1, keepdims=True)
     np.testing.assert_allclose(scores, (units @ directions.T).mean(axis=0), atol=1e-5)

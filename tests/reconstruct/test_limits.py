@@ -16,7 +16,7 @@ from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
 from gsencoder.reconstruct import plan as planning
 from gsencoder.reconstruct import reconstruct, sfm
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
 from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, PLAN
 from gsencoder.reconstruct.plan import Costs, ReconstructBudget
 from gsencoder.reconstruct.run import ReconstructConfig
@@ -81,7 +81,6 @@ def test_what_reading_took_counts_to_limited_seconds(scene: Scene, monkeypatch: 
 @pytest.mark.parametrize(
     ("config", "problem"),
     [
-        (lambda: replace(short(megabytes=1.0), prune=PruneConfig(at=())), "prune.at=.. never prunes"),
         (lambda: replace(short(megabytes=1.0), optimize=OptimizeConfig(steps=0)), "optimize.steps=0 never prunes"),
         (lambda: short(seconds=9.0), "optimize.steps=4: is chosen by budget.seconds"),
         (lambda: limited(seconds=float("nan")), "seconds: expected a number above 0, got nan"),

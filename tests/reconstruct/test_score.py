@@ -108,8 +108,9 @@ def test_the_loss_is_the_opacity_over_empty_pixels() -> None:
 def test_what_floats_in_empty_space_fades_and_the_wall_stays(weight: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The seeds stand on the wall everywhere; without the term nothing acts on those before empty pixels."""
     monkeypatch.setitem(RATES, "logit_opacities", 0.5)
+    monkeypatch.setattr("gsencoder.reconstruct.optimize.EMPTY_WEIGHT", weight)
     gaussians = seed_from_depth(wall_views(depth=True), voxel=0.2)
-    config = OptimizeConfig(steps=12, sh_degree=0, empty_weight=weight, exposure=False, shrinks=(2,), shares=(1.0,))
+    config = OptimizeConfig(steps=12, sh_degree=0, exposure=False, shrinks=(2,), shares=(1.0,))
     one = wall_optimizer(config, gaussians, half_empty_views(), (0, 1, 2))
     before = score(one, [3])
     for _ in range(config.steps):

@@ -64,6 +64,10 @@ CAPTION_KEYS = "scene_id, view and caption"
 MAX_LIST_BYTES = 256 << 20
 
 
+STRIDE = 4
+"""Pixels from one rendered pixel to the next, along both sides of a view."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RetrievalProtocol(Protocol):
     """Which texts belong to views, and how both are compared."""
@@ -74,7 +78,6 @@ class RetrievalProtocol(Protocol):
         "", "texts of other pictures, one a line; empty = the pool of a view is the other views' texts"
     )
     count: int = option(0, "of these, texts in a view's pool, drawn by its name; 0 = all", ge=0)
-    stride: int = option(4, "pixels from one rendered pixel to the next, along both sides of a view", ge=1)
     pooling: Literal["max", "mean"] = option("max", "of the cosines of a view's pixels: max (M3) or mean")
     mode: Mode = option("centered", "cosines less the mean of features and words, or raw as in M3")
 
@@ -226,7 +229,7 @@ def score_views(
     products = GaussianProducts(features, protocol.mode)
     scores = np.full((len(views), len(directions)), np.nan)
     for row, view in enumerate(views):
-        b = blend(scene.gaussians, scene.views.cameras, view, stride=protocol.stride)
+        b = blend(scene.gaussians, scene.views.cameras, view, stride=STRIDE)
         pixels = pixel_features(products, b, memory=memory, mode=protocol.mode)
         covered = pixels.alpha > 0
         if not covered.any():
