@@ -22,3 +22,15 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith(("warning: ", "note: "))]
     assert len(lines) == 1
     return lines[0]
+
+
+QUICK = (
+    "quiet=true",
+    "train.steps=6",
+    "train.warmup=2",
+    "train.log_every=2",
+    "sampling.gaussians=600",
+    "sampling.smallest=200",
+    "model.transformer.encoder_channels=[32,32,32,32,32]",
+    "model.transformer.decoder_channels=[32,32,32,32]",
+)

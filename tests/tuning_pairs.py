@@ -2,14 +2,16 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 from tiny_vlm import SIDE, save_tiny_vlm
 
+from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.data.prompts import PromptStore
 from gsencoder.train.loop import TrainerConfig
-from gsencoder.train.tune import TuneConfig, TuningPair
+from gsencoder.train.tune import PairSamples, TuneConfig, TuningPair, TuningSample, open_processor
 from gsencoder.train.vlm import AdapterConfig
 
 THINGS = ("mug", "chair", "box", "crate", "lamp")
@@ -49,3 +51,25 @@ def make_model(folder: Path) -> Path:
     """The tiny model, whose output layer lets an answer become likely."""
     save_tiny_vlm(folder, SPREAD)
     return folder
+
+
+Pairs = tuple[list[TuningPair], PromptStore]
+
+
+def made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def losses(folder: Path) -> list[float]:
+    return [float(row["loss"]) for row in read_log(folder / LOG_FILE)]
+
+
+def samples(pairs: Pairs, model: Path, **changes: Any) -> PairSamples:
+    _, processor, _ = open_processor(model)
+    return PairSamples(pairs[0], pairs[1], processor, **({"longest": None, "seed": 0} | changes))
+
+
+def sample(data: PairSamples, number: int = 0) -> TuningSample:
+    pair = data.pairs[number]
+    return data.sample(pair, pair.answers[0])

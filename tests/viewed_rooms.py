@@ -1,14 +1,17 @@
 """A small synthetic room with features of names, and photographs, that tests of the page stand on."""
 
+import json
+import struct
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.infer.page.page import Bundle
+from gsencoder.infer.page.page import MAGIC, Bundle, Container
 from gsencoder.infer.page.search import SceneSearch, drawn_scene, object_numbers
 from gsencoder.text.table import TextTable, load_text_table, make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
@@ -61,3 +64,25 @@ def search_of(folder: Path, *, max_gaussians: int = 1_000_000) -> SceneSearch:
     """The search over the features in a folder."""
     shown = drawn_scene(load_features(folder), "features", max_gaussians=max_gaussians)
     return SceneSearch(shown=shown, words=load_text_table(folder / WORDS_FILE), config=LocalizeConfig())
+
+
+def read_container(data: bytes) -> Container:
+    """Reads what `Container.to_bytes` wrote.
+
+    Raises:
+        InputError: something else, or cut off.
+    """
+    begin = len(MAGIC) + 4
+    if data[: len(MAGIC)] != MAGIC or len(data) < begin:
+        raise InputError(f"expected {len(data)} bytes that begin with {MAGIC!r}, got {data[:8]!r}")
+    (length,) = struct.unpack_from("<I", data, len(MAGIC))
+    header = json.loads(data[begin : begin + length])
+    arrays = {}
+    for name, entry in header["arrays"].items():
+        count = int(np.prod(entry["shape"], dtype=np.int64))
+        kind = np.dtype(entry["type"]).newbyteorder("<")
+        at = begin + length + entry["offset"]
+        if at + count * kind.itemsize > len(data):
+            raise InputError(f"array {name!r} ends behind the {len(data):,} bytes there are")
+        arrays[name] = np.frombuffer(data, kind, count, at).reshape(entry["shape"]).astype(entry["type"])
+    return Container(meta=header["meta"], arrays=arrays)

@@ -8,6 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 import transformers
+from splats import front_camera
+
+from gsencoder.teachers.tower import TransformersConfig, TransformersTeacher
+from gsencoder.types import Views
 
 SIDE, PATCH = 32, 8
 """Pixels along the pictures that the models are made for, and along a patch."""
@@ -194,3 +198,34 @@ def tower_of(model: Any) -> Any:
 
 def picture(height: int, width: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+WIDE = picture(30, 60)
+
+
+def views(*images: np.ndarray) -> Views:
+    cameras = front_camera(images[0].shape[1], images[0].shape[0])
+    return Views(cameras=cameras, names=("left.png",), images=list(images))
+
+
+def teacher(folder: Path, **settings: Any) -> TransformersTeacher:
+    return TransformersTeacher(TransformersConfig(model=str(folder), device="cpu", **settings))
+
+
+def features(folder: Path, image: np.ndarray = WIDE, **settings: Any) -> np.ndarray:
+    made = teacher(folder, **settings).feature_map(views(image), 0).features
+    assert made is not None
+    return made
+
+
+def rewrite(path: Path, **changes: Any) -> None:
+    stated = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({name: value for name, value in stated.items() if value is not None}))
+
+
+def change_weights(folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    from safetensors.torch import load_file, save_file
+
+    weights = change(load_file(folder / "model.safetensors"))
+    made = {name: value.contiguous() for name, value in weights.items()}
+    save_file(made, folder / "model.safetensors", {"format": "pt"})

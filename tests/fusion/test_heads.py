@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from measured_heads import SPACE, measured
 from torch import nn
 
 from gsencoder.core.archive import write_archive
@@ -17,6 +16,7 @@ from gsencoder.fusion.errors import CellSample
 from gsencoder.fusion.folder import copy_heads, find_heads
 from gsencoder.fusion.measured_heads import (
     HeadSet,
+    MeasuredHead,
     choose_heads,
     find_head,
     has_head,
@@ -28,8 +28,25 @@ from gsencoder.fusion.measured_heads import (
     measure_heads,
     save_heads,
 )
-from gsencoder.teachers.heads import Head
+from gsencoder.teachers.heads import Head, Residual
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
+
+SPACE = FeatureSpace(name="radio", channels=6, teacher="radio", weights="abcd", preprocessing="resized")
+
+
+def body(channels: int = 4) -> nn.Sequential:
+    torch.manual_seed(channels)
+    block = Residual(nn.LayerNorm(8), nn.GELU(), nn.Linear(8, 8))
+    layers = nn.Sequential(nn.Linear(6, 8), block, nn.LayerNorm(8), nn.ReLU(), nn.Linear(8, channels))
+    for parameter in layers.parameters():
+        nn.init.normal_(parameter)
+    return layers
+
+
+def measured(name: str = "siglip.summary", channels: int = 4, text: str = "siglip") -> MeasuredHead:
+    mean = np.arange(channels, dtype=np.float32)
+    head = Head(name=name, body=body(channels), text=text, model="M")
+    return MeasuredHead(head=head, mean=mean, scale=2.0, cells=3, cosine=0.5, worst=0.25)
 
 
 def head_set() -> HeadSet:

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewed_rooms import HOSTILE, STUB, room_scene, save_viewed_room, search_of
-from viewer_containers import read_container
+from viewed_rooms import HOSTILE, STUB, read_container, room_scene, save_viewed_room, search_of
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat

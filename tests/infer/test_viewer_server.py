@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
-from viewer_containers import read_container
+from viewed_rooms import STUB, read_container, room_scene, save_viewed_room, search_of
 
 from gsencoder.core.errors import InputError
 from gsencoder.infer.localize import LocalizeConfig

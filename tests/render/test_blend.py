@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from dense_blends import EXTREMES, dense
-from splats import front_camera, one_gaussian, random_gaussians
+from splats import EXTREMES, dense, front_camera, one_gaussian, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import BlendConfig, blend, blend_torch

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from dense_blends import EXTREMES, dense
-from splats import front_camera, one_gaussian, random_gaussians, random_rotation
+from splats import EXTREMES, dense, front_camera, one_gaussian, random_gaussians, random_rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import BlendConfig, blend

@@ -9,8 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tower_files import WIDE, features, rewrite, teacher, views
-from vision_towers import SIDE, picture, save_vision_tower
+from vision_towers import SIDE, WIDE, features, picture, rewrite, save_vision_tower, teacher, views
 
 from gsencoder.teachers.tower import map_in_windows, window_starts
 

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import torch
 from splats import front_camera
-from tower_files import change_weights, features, rewrite, teacher
-from vision_towers import LAYERS
+from vision_towers import LAYERS, change_weights, features, rewrite, teacher
 
 from gsencoder.core.errors import InputError
 from gsencoder.teachers.tower import TransformersConfig, TransformersTeacher

@@ -4,10 +4,8 @@ from pathlib import Path
 
 import pytest
 from joint_training import Datasets, prepared_by_both
-from trainer_runs import Prepared
-from training_scenes import prepared
-from tuning_pairs import make_model, make_pairs
-from tuning_runs import Pairs
+from training_scenes import Prepared, prepared
+from tuning_pairs import Pairs, make_model, make_pairs
 
 
 @pytest.fixture(scope="session")

@@ -11,8 +11,18 @@ import pytest
 import torch
 from archives import header_of
 from safetensors.numpy import load_file
-from trainer_runs import Prepared, assert_same_weights, losses, rows, steps_in, trainer
-from training_scenes import LOSSES, SHORT, samples, small_encoder
+from training_scenes import (
+    LOSSES,
+    SHORT,
+    Prepared,
+    assert_same_weights,
+    losses,
+    rows,
+    samples,
+    small_encoder,
+    steps_in,
+    trainer,
+)
 
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError

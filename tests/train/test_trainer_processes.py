@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from forked_ranks import RankServer
-from trainer_runs import Prepared, assert_same_weights, losses, rows, steps_in, weights_in
+from training_scenes import Prepared, assert_same_weights, losses, rows, steps_in, weights_in
 
 from gsencoder.core.logs import LOG_FILE
 

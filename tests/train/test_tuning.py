@@ -14,8 +14,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 from tiny_vlm import PATCH, SIDE
-from tuning_pairs import SHORT, make_pairs
-from tuning_runs import Pairs, losses, made, sample, samples
+from tuning_pairs import SHORT, Pairs, losses, made, make_pairs, sample, samples
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.logs import LOG_FILE, read_log

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
+from command_runs import QUICK
 from named_rooms import write_words
-from short_training import QUICK
 
 from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from short_training import QUICK
+from command_runs import QUICK
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands.train import TrainCommandConfig

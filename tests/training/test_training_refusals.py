@@ -4,8 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_runs import refusal
-from short_training import QUICK
+from command_runs import QUICK, refusal
 
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 

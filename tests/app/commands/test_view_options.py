@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_runs import refusal
-from viewed_rooms import STUB, name_features, room_scene, save_viewed_room
-from viewer_containers import read_container
+from viewed_rooms import STUB, name_features, read_container, room_scene, save_viewed_room
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands import view
