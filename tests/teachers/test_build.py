@@ -5,9 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
+from region_scenes import save_colors
 from text_towers import save_graph, save_tokenizer
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
@@ -136,13 +135,7 @@ def test_a_joint_model_needs_a_tower_of_its_width(tmp_path: Path) -> None:
     words = sorted(set(" ".join(REFERENCE_NOUNS).split()))
     save_tokenizer(tmp_path / "tokenizer.json", ("[PAD]", "[UNK]", "[CLS]", "[SEP]", *words))
     save_graph(tmp_path / "model.onnx", rows=1000)
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "h", "w"])
-    features = helper.make_tensor_value_info("features", TensorProto.FLOAT, [1, 3, "h", "w"])
-    graph = helper.make_graph([helper.make_node("Identity", ["image"], ["features"])], "net", [image], [features])
-    onnx.save(
-        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), tmp_path / "net.onnx"
-    )
-    config = OnnxConfig(model=str(tmp_path / "net.onnx"), layout="grid", patch=1, joint=True)
+    config = OnnxConfig(model=str(save_colors(tmp_path / "net.onnx")), layout="grid", patch=4, joint=True)
     vocabulary = words_of(config, OnnxTextConfig(model=str(tmp_path), pooling="mean"))
     with pytest.raises(InputError, match="its features have 3 channels and its words 6"):
         build_teacher(config, Scene(name="s"), vocabulary)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 import transformers
-from onnx import helper, numpy_helper
 from PIL import Image
-from region_scenes import WIDTH, labels_of, region_scene, save_colors, save_net, save_pool, toy_words, write_masks
+from region_scenes import labels_of, region_scene, save_colors, save_pool, toy_words, write_masks
 from region_teachers import PLAIN, SMALL, VISION, build, made
 from vision_towers import JOINT_CHANNELS, save_preprocessing
 from vision_towers import VISION as TOWER_VISION
@@ -181,21 +180,3 @@ def test_a_crop_teacher_without_a_joint_space_takes_no_words_beside_one_that_has
     assert not config.takes_text()
     assert replace(config, joint=True).takes_text()
     assert replace(config, model=str(tmp_path / "clip")).takes_text()
-
-
-def test_tokens_before_those_of_patches_are_skipped(tmp_path: Path) -> None:
-    """The same map as a grid, and as tokens behind one of the whole picture."""
-    masks, grid = write_masks(tmp_path / "m"), save_colors(tmp_path / "grid.onnx")
-    constants = {"shape": np.array([1, 3, -1]), "first": np.full((1, 1, 3), 9, np.float32)}
-    tokens = save_net(
-        tmp_path / "tokens.onnx",
-        *(helper.make_node("Constant", [], [name], value=numpy_helper.from_array(v)) for name, v in constants.items()),
-        helper.make_node("AveragePool", ["image"], ["cells"], kernel_shape=[4, 4], strides=[4, 4]),
-        helper.make_node("Reshape", ["cells", "shape"], ["rows"]),
-        helper.make_node("Transpose", ["rows"], ["patches"], perm=[0, 2, 1]),
-        helper.make_node("Concat", ["first", "patches"], ["out"], axis=1),
-    )
-    options = OnnxRegionOptions(layout="tokens", skip_tokens=1, patch=4, size=WIDTH, **PLAIN)
-    expected = made(build(masks, grid, "map", min_area=1), 0)
-    skipped = made(build(masks, tokens, "map", min_area=1, onnx=options), 0)
-    np.testing.assert_allclose(skipped.table, expected.table, rtol=1e-6)

@@ -16,7 +16,6 @@ from gsencoder.text.table import (
     TowerRecord,
     cache_folder,
     cached_vectors,
-    embed_in_templates,
     load_text_table,
     make_text_table,
     save_text_table,
@@ -69,14 +68,6 @@ def test_the_mean_does_not_depend_on_further_names(tower: HashTower) -> None:
     np.testing.assert_allclose(vocabulary(tower).mean, expected, atol=1e-6)
 
 
-def test_templates_are_averaged(tower: HashTower) -> None:
-    templates = ("a photo of a {}", "{}, seen from above")
-    plain = HashTower().embed(["a photo of a mug", "mug, seen from above"])
-    np.testing.assert_allclose(
-        embed_in_templates(tower, ["mug"], templates)[0], unit(plain.sum(0, keepdims=True))[0], atol=1e-6
-    )
-
-
 def test_a_table_comes_back_from_its_file_with_the_record_of_its_tower(tower: HashTower, tmp_path: Path) -> None:
     words = vocabulary(tower, templates=("a {}", "the {}"))
     save_text_table(tmp_path / "words.safetensors", words.table)
@@ -102,12 +93,9 @@ def test_without_the_tower_its_words_work_and_an_error_says_what_to_get(
 def test_the_record_of_a_tower_has_a_known_kind_and_short_texts(no_jaxtyping: None) -> None:
     good: dict[str, Any] = {"kind": "onnx", "name": "n", "identity": "i", "pooling": "p" * 1000}
     TowerRecord(**good)
-    for name in good:
-        for wrong in ("", "p" * 1001, 5):
-            with pytest.raises(InputError, match="expected a kind among onnx, transformers, a name"):
-                TowerRecord(**{**good, name: wrong})
-    with pytest.raises(InputError, match="expected a kind among onnx, transformers"):
-        TowerRecord(**{**good, "kind": "table"})
+    for wrong in ({"name": ""}, {"identity": 5}, {"pooling": "p" * 1001}, {"kind": "table"}):
+        with pytest.raises(InputError, match="expected a kind among onnx, transformers, a name"):
+            TowerRecord(**{**good, **wrong})
 
 
 @pytest.mark.parametrize("config", [OnnxTextConfig, TransformersTextConfig])
@@ -189,12 +177,11 @@ def test_the_cache_lies_where_the_user_says_or_among_the_caches_of_the_user(
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "mine"))
     assert cache_folder() == tmp_path / "mine" / "text"
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    for unset in ("", None):
-        monkeypatch.delenv(CACHE_VARIABLE) if unset is None else monkeypatch.setenv(CACHE_VARIABLE, unset)
-        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-        assert cache_folder() == tmp_path / "home" / ".cache" / "gsencoder" / "text"
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
-        assert cache_folder() == tmp_path / "caches" / "gsencoder" / "text"
+    monkeypatch.delenv(CACHE_VARIABLE)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    assert cache_folder() == tmp_path / "home" / ".cache" / "gsencoder" / "text"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    assert cache_folder() == tmp_path / "caches" / "gsencoder" / "text"
 
 
 def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -118,10 +118,8 @@ def test_a_table_saved_in_half_precision_is_half_as_large_and_has_unit_rows(tmp_
     assert read.names == table.names
     np.testing.assert_allclose(np.linalg.norm(read.embeddings, axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(read.embeddings, table.embeddings, atol=5e-4)
-
-
-def test_a_half_precision_file_gives_unit_rows_and_the_encoder_of_its_name(table: TextTable, tmp_path: Path) -> None:
-    path = save_npz(tmp_path / "toy_names.npz", names=np.array(NAMES), embeddings=table.embeddings.astype(np.float16))
+    # An .npz without the name of an encoder is called like its file.
+    path = save_npz(tmp_path / "toy_names.npz", names=np.array(table.names), embeddings=np.float16(table.embeddings))
     read = load_text_table(path)
     assert read.space.text_encoder == "toy"
     np.testing.assert_allclose(np.linalg.norm(read.embeddings, axis=1), 1, atol=1e-6)
@@ -183,45 +181,6 @@ def test_a_bomb_is_refused_by_the_size_that_it_states(tmp_path: Path, monkeypatc
     monkeypatch.setattr("gsencoder.core.archive.LARGEST_ARRAY", 100_000)
     with pytest.raises(InputError, match="claims 400,128 bytes"):
         load_text_table(path)
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
-def test_every_truncation_is_an_error_of_one_line(table: TextTable, tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"table{suffix}"
-    if suffix == ".npz":
-        np.savez_compressed(path, names=np.array(NAMES), embeddings=table.embeddings)
-    else:
-        save_text_table(path, table)
-    whole = path.read_bytes()
-    for length in (0, 1, 8, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:length])
-        with pytest.raises(InputError) as caught:
-            load_text_table(path)
-        assert "\n" not in str(caught.value)
-
-
-@given(st.binary(max_size=200), st.integers(0, 4000), st.sampled_from([".npz", ".safetensors"]))
-@settings(deadline=None, max_examples=50)
-def test_bytes_overwritten_anywhere_give_a_table_or_an_input_error(
-    tmp_path_factory: pytest.TempPathFactory, patch: bytes, at: int, suffix: str
-) -> None:
-    path = tmp_path_factory.mktemp("fuzz") / f"table{suffix}"
-    table = make_text_table(("mug", "box"), np.eye(2), "toy")
-    if suffix == ".npz":
-        save_npz(path, names=np.array(["mug", "box"]), embeddings=np.eye(2))
-    else:
-        save_text_table(path, table)
-    data = bytearray(path.read_bytes())
-    at %= len(data)
-    data[at : at + len(patch)] = patch
-    path.write_bytes(data)
-    message = ""
-    try:
-        read: TextTable | None = load_text_table(path)
-    except InputError as error:
-        read, message = None, str(error)
-    assert (read is None) == bool(message)
-    assert "\n" not in message
 
 
 def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None:
@@ -288,3 +247,14 @@ def test_words_of_another_space_are_an_error_that_names_both(text: FeatureSpace)
     check_space(space("clip", teacher="labels"), space("clip"))
     with pytest.raises(InputError, match="it has no text encoder"):
         check_space(space(""), space(""))
+
+
+def test_truncated_files_are_refused(table: TextTable, tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "t.npz", names=np.array(NAMES), embeddings=table.embeddings)
+    save_text_table(tmp_path / "t.safetensors", table)
+    for path in (tmp_path / "t.npz", tmp_path / "t.safetensors"):
+        whole = path.read_bytes()
+        for length in (0, 8, len(whole) // 2, len(whole) - 1):
+            path.write_bytes(whole[:length])
+            with pytest.raises(InputError):
+                load_text_table(path)
