@@ -20,6 +20,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
@@ -164,7 +165,7 @@ class Archive:
 
     def __init__(self, path: Path, file: Any, stream: BinaryIO, header: dict[str, Any]) -> None:
         """`file` is that of safetensors, for names, types and shapes; arrays are read from `stream`."""
-        self.path, self.sizes = path, dict[str, int]()
+        self.path, self.sizes, self._prefix = path, dict[str, int](), ""
         self._file, self._header, self._names = file, header, frozenset(file.keys())
         self._stream, self._offsets = stream, array_offsets(stream)
         version = header.get("version")
@@ -208,6 +209,7 @@ class Archive:
     def _read(self, name: str) -> np.ndarray:
         # Not through the memory map of safetensors, which ends the process where the file is cut off meanwhile.
         dtype, shape = self._stored(name)
+        name = self._prefix + name
         if dtype not in NAMES_OF_DTYPES:
             raise InputError(f"{self.path}: {name} has type {dtype}, expected one of {', '.join(NAMES_OF_DTYPES)}")
         data = read_bytes(self._stream, *self._offsets.get(name, (0, 0)))
@@ -219,6 +221,7 @@ class Archive:
 
     def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
         """Type and shape of an array according to the file."""
+        name = self._prefix + name
         if name not in self._names:
             raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
         stored = self._file.get_slice(name)
@@ -242,27 +245,15 @@ class Archive:
         for name in sorted(self._names):
             self._read(name)
 
-    def section(self, prefix: str, header: Mapping[str, Any]) -> "ArchiveSection":
-        """A part of the archive: the arrays whose names begin with `prefix`, with a header of its own."""
-        return ArchiveSection(self, prefix, header)
+    def section(self, prefix: str, header: Mapping[str, Any]) -> "Archive":
+        """A part of the archive: the arrays whose names begin with `prefix`, named without it, with a header and
+        letters in shapes of its own."""
+        part = copy(self)
+        part.sizes, part._prefix, part._header = {}, prefix, dict(header)
+        return part
 
     def __contains__(self, key: str) -> bool:
-        return key in self._header or key in self._names
-
-
-class ArchiveSection(Archive):
-    """A part of an archive, in which arrays are named without their prefix, and letters in shapes are its own."""
-
-    def __init__(self, archive: Archive, prefix: str, header: Mapping[str, Any]) -> None:
-        self.path, self.sizes = archive.path, dict[str, int]()
-        self._archive, self._prefix, self._header = archive, prefix, dict(header)
-        self._names = frozenset(name.removeprefix(prefix) for name in archive._names if name.startswith(prefix))
-
-    def _read(self, name: str) -> np.ndarray:
-        return self._archive._read(self._prefix + name)
-
-    def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
-        return self._archive._stored(self._prefix + name)
+        return key in self._header or self._prefix + key in self._names
 
 
 def _listed(shape: tuple[int | str, ...]) -> str:
@@ -373,13 +364,14 @@ class MappedArrays:
             self._check(name, np.flatnonzero(self._unchecked[name]))
         return self._arrays[name]
 
-    def rows(self, name: str, rows: Int[np.ndarray, " n"]) -> np.ndarray:
-        """Copies rows of an array."""
+    def rows(self, name: str, rows: Int[np.ndarray, " n"] | slice) -> np.ndarray:
+        """Copies rows of an array; of a slice from one row to another it is a view of the map."""
         self._check_size()
         array = self._arrays[name]
-        if name in self._unchecked and len(rows):
+        if name in self._unchecked:
             size = array.dtype.itemsize * int(np.prod(array.shape[1:]))
-            first = rows.astype(np.int64) * size
+            numbers = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
+            first = numbers.astype(np.int64) * size
             touched = np.zeros(len(self._unchecked[name]), bool)
             # A row may extend over several blocks.
             for offset in range(0, size + BLOCK_BYTES, BLOCK_BYTES):
@@ -387,16 +379,6 @@ class MappedArrays:
             self._check(name, np.flatnonzero(touched & self._unchecked[name]))
         values: np.ndarray = array[rows]
         return values
-
-    def row_range(self, name: str, first: int, last: int) -> np.ndarray:
-        """Rows `first` to `last`, exclusive, of an array; a view of the map."""
-        self._check_size()
-        array = self._arrays[name]
-        if name in self._unchecked and last > first:
-            size = array.dtype.itemsize * int(np.prod(array.shape[1:]))
-            blocks = np.arange(first * size // BLOCK_BYTES, -(-last * size // BLOCK_BYTES))
-            self._check(name, blocks[self._unchecked[name][blocks]])
-        return array[first:last]
 
     def _check_size(self) -> None:
         _, written, _ = self._stamp

@@ -350,11 +350,11 @@ def check_written(path: str | Path) -> None:
     file = Path(path).absolute()
     summaries = [Path(f"{file}.{SUMMARY_NAME}"), *(folder / SUMMARY_NAME for folder in list(file.parents)[:LEVELS])]
     for summary in summaries:
-        stated = _stated(summary, file)
-        if stated is None:
+        recorded = _recorded(summary, file)
+        if recorded is None:
             continue
         try:
-            same = sha256_of(file) == stated
+            same = sha256_of(file) == recorded
         except (OSError, InputError):
             return  # Whoever reads it says so.
         if not same:
@@ -367,13 +367,13 @@ def check_written(path: str | Path) -> None:
         return
 
 
-def _stated(summary: Path, file: Path) -> str | None:
+def _recorded(summary: Path, file: Path) -> str | None:
     try:
         files = json.loads(read_foreign(summary, LARGEST_SUMMARY))["files"]
-        stated = files.get(file.relative_to(summary.parent).as_posix())
+        recorded = files.get(file.relative_to(summary.parent).as_posix())
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
-    return stated if isinstance(stated, str) else None
+    return recorded if isinstance(recorded, str) else None
 
 
 SUM = "sum"

@@ -63,11 +63,8 @@ class Kernel:
 
 kernel = Kernel
 """Decorates a function that `parallel` calls."""
-
-
-def compiled(function: Callable[..., Any]) -> Kernel:
-    """Decorates a function whose products are not fused with sums."""
-    return Kernel(function, fused=False)
+compiled = functools.partial(Kernel, fused=False)
+"""Decorates a function whose products are not fused with sums."""
 
 
 @functools.cache

@@ -314,13 +314,13 @@ class PreparedScene:
         crow = np.array(self._arrays.array("crow")[first : last + 1])
         start, end = int(crow[0]), int(crow[-1])
         with self._error_context():
-            targets = self._scaled("row_targets", self._arrays.row_range("row_targets", first, last))
+            targets = self._scaled("row_targets", self._arrays.rows("row_targets", slice(first, last)))
             view_rows = ViewRows(
                 crow=crow - start,
-                col=np.array(self._arrays.row_range("col", start, end)),
-                weight=self._arrays.row_range("weight", start, end).astype(np.float32),
+                col=np.array(self._arrays.rows("col", slice(start, end))),
+                weight=self._arrays.rows("weight", slice(start, end)).astype(np.float32),
                 targets=targets.astype(np.float32, copy=False),
-                valid=self._arrays.row_range("row_valid", first, last).astype(bool),
+                valid=self._arrays.rows("row_valid", slice(first, last)).astype(bool),
             )
             in_range = (view_rows.col >= 0) & (view_rows.col < len(self))
             if not in_range.all() or not (view_rows.weight >= 0).all() or not np.isfinite(view_rows.targets).all():

@@ -62,7 +62,7 @@ READS: dict[str, Callable[[Path], None]] = {
     "an array of an archive": read_of_archive,
     "a whole array": read_of_map(lambda mapped: mapped.array("rows")),
     "rows": read_of_map(lambda mapped: mapped.rows("rows", np.array([len(ROWS) - 1]))),
-    "a range of rows": read_of_map(lambda mapped: mapped.row_range("rows", len(ROWS) - 9, len(ROWS))),
+    "a range of rows": read_of_map(lambda mapped: mapped.rows("rows", slice(len(ROWS) - 9, len(ROWS)))),
     "a .npy file": read_of_npy,
 }
 
