@@ -345,14 +345,11 @@ def suppress(proposals: Iterable[Proposal], max_overlap: float) -> list[Proposal
     above `max_overlap`."""
     staying: list[Proposal] = []
     for proposal in proposals:
-        if not any(_overlap(proposal, better, max_overlap) for better in staying):
+        # The IoU is at most the ratio of the areas, which is quickly known.
+        near = (b for b in staying if min(proposal.area, b.area) > max_overlap * max(proposal.area, b.area))
+        if all(mask_iou(proposal, better) <= max_overlap for better in near):
             staying.append(proposal)
     return staying
-
-
-def _overlap(a: Proposal, b: Proposal, most: float) -> bool:
-    """Whether the IoU of two masks is above `most`; it is at most the ratio of their areas, which is quickly known."""
-    return min(a.area, b.area) > most * max(a.area, b.area) and mask_iou(a, b) > most
 
 
 def paint(proposals: Sequence[Proposal], size: tuple[int, int]) -> Int32[np.ndarray, "H W"]:

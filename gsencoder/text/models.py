@@ -35,22 +35,35 @@ KNOWN_INPUTS = ("input_ids", "attention_mask", "token_type_ids", "position_ids")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OnnxTextConfig:
+class TowerOptions:
+    """How a text tower makes one vector of a phrase."""
+
+    pooling: Literal["auto"] | Pooling = option(
+        "auto",
+        "how token vectors become one: mean, cls = the first, eos = the last, output = the model does it; "
+        "auto = as the kind of model or its folder says",
+    )
+    templates: tuple[str, ...] = option(NO_TEMPLATES, "sentences with {} for the phrase, whose vectors are averaged")
+
+    def __post_init__(self) -> None:
+        check_templates(self.templates)
+
+
+def pool_tokens(tokens: np.ndarray, pooling: str) -> Float32[np.ndarray, " D"]:
+    """One of the vectors [T, D] of the tokens of a phrase: their mean, the first (cls) or the last (eos)."""
+    if pooling == "mean":
+        return tokens.mean(axis=0, dtype=np.float64).astype(np.float32)
+    return tokens[0 if pooling == "cls" else -1].astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnnxTextConfig(TowerOptions):
     """A text tower in a folder with an ONNX graph and `tokenizer.json`."""
 
     name: Literal["onnx"] = "onnx"
     model: str = option(
         "", "folder with model.onnx and tokenizer.json; also looked for in GSENCODER_MODELS; minilm_l6 is installed"
     )
-    pooling: Literal["auto"] | Pooling = option(
-        "auto",
-        "how token vectors become one: mean, cls = the first, eos = the last, output = the model does it; "
-        "auto = as the folder says",
-    )
-    templates: tuple[str, ...] = option(NO_TEMPLATES, "sentences with {} for the phrase, whose vectors are averaged")
-
-    def __post_init__(self) -> None:
-        check_templates(self.templates)
 
 
 class OnnxTower:
@@ -135,9 +148,7 @@ class OnnxTower:
             )
         if self.pooling == "output":
             return output[0].astype(np.float32)
-        if self.pooling == "mean":
-            return output[0, :count].mean(axis=0, dtype=np.float64).astype(np.float32)
-        return output[0, 0 if self.pooling == "cls" else count - 1].astype(np.float32)
+        return pool_tokens(output[0, :count], self.pooling)
 
     def _choose_pooling(self, requested: str) -> tuple[str, str]:
         """The pooling, and the output that it takes."""
@@ -274,24 +285,15 @@ JOINT: Mapping[str, JointText] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TransformersTextConfig:
+class TransformersTextConfig(TowerOptions):
     """A text tower in a folder that transformers reads."""
 
     name: Literal["transformers"] = "transformers"
     model: str = option("", "folder of the model and its tokenizer; also looked for in GSENCODER_MODELS")
-    pooling: Literal["auto"] | Pooling = option(
-        "auto",
-        "how token vectors become one: mean, cls = the first, eos = the last, output = the model does it; "
-        "auto = as the kind of model or its folder says",
-    )
     lower: Literal["auto", "yes", "no"] = option(
         "auto", "lower-case phrases and remove punctuation; auto = where the kind of model was trained so"
     )
-    templates: tuple[str, ...] = option(NO_TEMPLATES, "sentences with {} for the phrase, whose vectors are averaged")
     device: Literal["auto", "cpu", "cuda"] = option("auto", "where it runs")
-
-    def __post_init__(self) -> None:
-        check_templates(self.templates)
 
 
 class TransformersTower:
@@ -356,10 +358,7 @@ class TransformersTower:
             name = self._kind.output if self._kind else "pooler_output"
             return np.asarray(outputs[name][0].float().cpu())
         tokens = outputs.last_hidden_state[0].float().cpu().numpy()
-        present = np.flatnonzero(inputs["attention_mask"][0].cpu().numpy())
-        if self.pooling == "mean":
-            return tokens[present].mean(axis=0, dtype=np.float64).astype(np.float32)
-        return np.asarray(tokens[present[0] if self.pooling == "cls" else present[-1]])
+        return pool_tokens(tokens[inputs["attention_mask"][0].cpu().numpy() > 0], self.pooling)
 
 
 def canonical(phrase: str) -> str:

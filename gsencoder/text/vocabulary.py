@@ -26,9 +26,6 @@ from gsencoder.text.table import (
 )
 from gsencoder.types import FeatureSpace
 
-OpenTower = Callable[[], TextTower]
-"""Loads a tower; InputError where it cannot be had."""
-
 
 class OpenVocabulary:
     """A text encoder that knows the names of a table at once, and loads its tower for any other phrase.
@@ -38,7 +35,7 @@ class OpenVocabulary:
         record: which tower made the table.
     """
 
-    def __init__(self, table: TextTable, open_tower: OpenTower) -> None:
+    def __init__(self, table: TextTable, open_tower: Callable[[], TextTower]) -> None:
         if table.tower is None:
             raise InputError(f"words of {table.space.text_encoder}: a closed table; no text tower belongs to it")
         self.table, self.record, self._open = table, table.tower, open_tower
