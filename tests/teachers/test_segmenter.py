@@ -1,4 +1,4 @@
-"""Segmenters as teachers: posteriors as shares of class names, from small ONNX graphs."""
+"""Segmenters as teachers: posteriors as shares of class names, from small ONNX graphs; their settings."""
 
 import json
 from collections.abc import Sequence
@@ -12,13 +12,21 @@ from onnx import TensorProto
 from segmenters import PLAIN, save_graph, teacher_of, views_of, words
 from splats import random_gaussians
 
+from gsencoder.core.errors import InputError
 from gsencoder.fusion.checkpoint import read_map, write_map
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.teachers import segmenter
-from gsencoder.teachers.build import build_teacher, stored_words
-from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.teachers.segmenter import synonyms_of_classes
-from gsencoder.text.table import unit
+from gsencoder.teachers.build import build_teacher, stored_words, words_of
+from gsencoder.teachers.labels import COLOR_NAMES, LabelsConfig, PaletteConfig
+from gsencoder.teachers.segmenter import (
+    OnnxSegmenterOptions,
+    SegmenterConfig,
+    SegmenterTeacher,
+    read_classes,
+    softmax,
+    synonyms_of_classes,
+)
+from gsencoder.text.table import TextTable, save_text_table, unit
 from gsencoder.text.vocabulary import make_vocabulary
 from gsencoder.types import FeatureMap, Scene, SceneObject, Views
 
@@ -148,3 +156,107 @@ def test_words_beside_labels_hold_the_names_of_all_objects(tmp_path: Path) -> No
     for name in ("abacus", "zebra crossing"):
         row = beside.find(name)
         np.testing.assert_allclose(beside.embeddings[row], HashTower().embed([name])[0], atol=1e-6)
+
+
+def test_a_segmenter_needs_a_model_words_and_pictures(tmp_path: Path, rng: np.random.Generator) -> None:
+    save_graph(tmp_path / "net.onnx")
+    config = SegmenterConfig(model=str(tmp_path / "net.onnx"))
+    with pytest.raises(InputError, match="its classes need words"):
+        build_teacher(config, Scene(name="s"), None)
+    with pytest.raises(InputError, match="teacher.model= is missing"):
+        build_teacher(SegmenterConfig(), Scene(name="s"), words(rng))
+
+
+def test_words_are_those_of_a_table_or_of_the_colors_or_none(tmp_path: Path, rng: np.random.Generator) -> None:
+    table = words(rng)
+    save_text_table(tmp_path / "words.safetensors", table)
+    read = words_of(SegmenterConfig(words=str(tmp_path / "words.safetensors")))
+    assert isinstance(read, TextTable)
+    assert read.names == table.names
+    np.testing.assert_array_equal(read.embeddings, table.embeddings)
+    assert words_of(SegmenterConfig()) is None
+    colors = words_of(PaletteConfig())
+    assert isinstance(colors, TextTable)
+    assert colors.names == COLOR_NAMES
+    np.testing.assert_array_equal(colors.encode(["red"])[0], np.eye(11)[COLOR_NAMES.index("red")])
+
+
+@pytest.mark.parametrize(("fourth", "probable"), [(0.509, True), (0.52, False), (0.48, False)])
+def test_outputs_that_are_probabilities_already_are_taken_as_they_are(
+    tmp_path: Path, rng: np.random.Generator, fourth: float, probable: bool
+) -> None:
+    """Rounded ones may differ from a sum of 1 by a hundredth."""
+    save_graph(tmp_path / "net.onnx", fourth=fourth)
+    image = np.broadcast_to(np.uint8([3, 6, 9]), (8, 12, 3)).copy()
+    made = teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, scale=36.0)).feature_map(views_of(image), 0)
+    scores = np.float32([3 / 36, 6 / 36, 9 / 36, fourth])
+    expected = scores if probable else softmax(scores[None, None], 1.0)[0, 0]
+    np.testing.assert_allclose(made.shares[1, 2], expected, atol=1e-6)
+
+
+def test_pictures_are_normalized_as_those_of_imagenet_unless_stated() -> None:
+    from transformers.image_utils import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
+
+    usual = OnnxSegmenterOptions()
+    assert (usual.scale, [*usual.mean], [*usual.std]) == (255, IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)
+
+
+@pytest.mark.parametrize("byte", [False, True])
+def test_settings_tell_how_pictures_are_given_to_the_network(
+    tmp_path: Path, rng: np.random.Generator, byte: bool
+) -> None:
+    """Maps that were made otherwise are not taken up; a network of bytes is not given normalized ones."""
+    save_graph(
+        tmp_path / "net.onnx", input_type=TensorProto.UINT8 if byte else TensorProto.FLOAT, shape=("n", 3, "h", "w")
+    )
+    table = words(rng)
+
+    def settings(**options: Any) -> dict[str, Any]:
+        return teacher_of(tmp_path / "net.onnx", table, replace(PLAIN, **options)).settings()
+
+    for options in ({"scale": 2.0}, {"mean": (0.0, 0.5, 0.0)}, {"std": (1.0, 1.0, 2.0)}):
+        assert (settings(**options) == settings()) is byte
+    assert settings(size=64) != settings()
+
+
+def test_softmax_holds_at_the_extremes() -> None:
+    logits = np.array([[[1e30, 0.0, -1e30]], [[-3e38, -3e38, -3e38]]], np.float32)
+    np.testing.assert_allclose(softmax(logits, 1e-3), [[[1, 0, 0]], [[1 / 3] * 3]], atol=1e-6)
+
+
+def test_what_does_not_fit_is_one_line(tmp_path: Path, rng: np.random.Generator, image: np.ndarray) -> None:
+    path, table = tmp_path / "net.onnx", words(rng)
+    save_graph(path)
+    with pytest.raises(InputError, match="1 of 96 values are not finite"):
+        _nan_teacher(path, table).feature_map(views_of(image), 0)
+    (tmp_path / "classes.json").write_text('["wall", "chair"]')
+    with pytest.raises(InputError, match="gives 4 classes, and there are 2 names for them"):
+        teacher_of(path, table).feature_map(views_of(image), 0)
+    (tmp_path / "classes.json").write_text('["wall", "zeppelin", "chair", "table"]')
+    with pytest.raises(InputError, match="'zeppelin'"):
+        teacher_of(path, table)
+    (tmp_path / "classes.json").write_text('{"0": "wall", "2": "chair"}')
+    with pytest.raises(InputError, match="expected a list of names, in the order of the network's classes"):
+        teacher_of(path, table)
+    with pytest.raises(InputError, match="no file says what its classes are called"):
+        SegmenterTeacher(SegmenterConfig(model=str(path)), table)
+
+
+def _nan_teacher(path: Path, table: TextTable) -> SegmenterTeacher:
+    teacher = teacher_of(path, table)
+    network = teacher._network
+    scores_of = network.scores
+
+    def broken(image: np.ndarray, num_classes: int) -> Any:
+        scores, probable, affine = scores_of(image, num_classes)
+        scores[0, 0, 0] = np.nan
+        return scores, probable, affine
+
+    network.scores = broken  # type: ignore[method-assign]
+    return teacher
+
+
+def test_names_are_read_from_lists_objects_and_lines(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"1": "b", "0": "a"}')
+    (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbfa\r\nb\r\n\r\n")
+    assert read_classes(tmp_path / "a.json") == read_classes(tmp_path / "b.txt") == ("a", "b")
