@@ -33,15 +33,10 @@ class Ranks:
 
     def ended(self, rank: int = 0, timeout: float = 300.0) -> int | None:
         """The exit code of a process (negative: the signal that ended it); None if it does not end in time."""
-        code: int | None = self.server.ask(wait=self.pids[rank], timeout=timeout)["code"]
-        return code
+        return self.server.ask(wait=self.pids[rank], timeout=timeout)["code"]
 
     def end_well(self) -> None:
-        """Waits for all of them.
-
-        Raises:
-            AssertionError: one ended with an error, or did not end.
-        """
+        """Waits for all of them, none of which may end with an error."""
         codes = [self.ended(rank) for rank in range(len(self.pids))]
         assert not any(code != 0 for code in codes), (codes, *(log.read_text()[-3000:] for log in self.logs))
 
@@ -70,19 +65,12 @@ class RankServer:
 
     def ask(self, **request: Any) -> dict[str, Any]:
         assert self._process.stdin is not None
-        assert self._process.stdout is not None
         print(json.dumps(request), file=self._process.stdin, flush=True)
-        answer: dict[str, Any] = json.loads(self._process.stdout.readline())
-        return answer
+        return json.loads(self._process.stdout.readline())
 
     def started(self, script: Path, *words: str, count: int = 2) -> Ranks:
-        """Starts a script as a number of processes that have one another's address.
-
-        Args:
-            script: a file, which is run as `__main__`; what it imports at its top is imported by the server, before.
-            words: its arguments.
-            count: number of processes.
-        """
+        """Starts a script as processes that have one another's address, each of which runs it as `__main__`; what it
+        imports at its top is imported by the server, before."""
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = str(free.getsockname()[1])
@@ -95,8 +83,6 @@ class RankServer:
 
     def close(self) -> None:
         """Ends the server."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         self._process.stdin.close()
         self._process.wait(30)
         self._process.stdout.close()

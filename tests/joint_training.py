@@ -21,7 +21,6 @@ class HeightTeacher(DenseSideTeacher):
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         seen = super().feature_map(views, view)
-        assert seen.features is not None
         rows = np.linspace(-1, 1, len(seen.features), dtype=np.float32)[:, None]
         features = np.stack(np.broadcast_arrays(rows, rows**2, np.sin(3 * rows), np.float32(0)), axis=-1)
         features = np.broadcast_to(features, seen.features.shape).astype(np.float32)

@@ -98,9 +98,6 @@ def scanned(scene: Scene, *, step: int = 1) -> tuple[np.ndarray, np.ndarray, np.
     Pixels are vertices, and neighbors at nearly one depth are joined.
     """
     views = scene.views
-    assert views is not None
-    assert views.depths is not None
-    assert views.instances is not None
     vertices, faces, instances, count = [], [], [], 0
     for view in range(len(views)):
         depth = views.depths[view][::step, ::step].astype(np.float64)

@@ -19,7 +19,6 @@ PREPARE = PrepareConfig(render_cell=2, render_min_weight=0.0)
 
 def hidden_features(scene: Scene, channels: int = 12) -> np.ndarray:
     """A smooth field over the wall with a mean that is longer than what varies."""
-    assert scene.gaussians is not None
     rng = np.random.default_rng(5)
     directions = rng.normal(size=(3, channels))
     waves = np.sin(scene.gaussians.means[:, :2].astype(np.float64) @ rng.normal(size=(2, 3)) * 2.5)

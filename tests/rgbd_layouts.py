@@ -18,7 +18,6 @@ def _picture(path: Path, values: np.ndarray) -> None:
 
 def _frames(scene: Scene) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Photograph, depth in metres and world_from_camera of each view."""
-    assert scene.views is not None
     assert scene.views.images is not None
     assert scene.views.depths is not None
     poses = scene.views.cameras.world_from_cam.astype(np.float64)
@@ -38,7 +37,6 @@ def write_seven_scenes(scene: Scene, folder: Path) -> None:
         _picture(stem.with_name(stem.name + ".color.png"), color)
         _picture(stem.with_name(stem.name + ".depth.png"), _steps(depth, 1000, none=65535))
         np.savetxt(stem.with_name(stem.name + ".pose.txt"), pose, delimiter="\t", newline="\r\n")
-    assert scene.views is not None
     np.savetxt(folder / "camera-intrinsics.txt", scene.views.cameras.Ks[0])
 
 
@@ -62,7 +60,6 @@ def write_tum(scene: Scene, folder: Path, *, late: float = 0.004) -> None:
 
 def write_replica(scene: Scene, folder: Path) -> None:
     """With cam_params.json beside the folder, as all rooms of the data set share one."""
-    assert scene.views is not None
     poses = []
     for index, (color, depth, pose) in enumerate(_frames(scene)):
         _picture(folder / "results" / f"frame{index:06d}.png", color)
@@ -76,7 +73,6 @@ def write_replica(scene: Scene, folder: Path) -> None:
 
 def write_scannetpp(scene: Scene, folder: Path) -> None:
     """The dslr/ folder with its transforms.json, whose paths count from resized_images, in nerfstudio's world."""
-    assert scene.views is not None
     K, frames = scene.views.cameras.Ks[0].astype(float), []
     for index, (color, _, pose) in enumerate(_frames(scene)):
         name = f"DSC{index:05d}.png"
@@ -92,7 +88,6 @@ def write_scannetpp(scene: Scene, folder: Path) -> None:
 
 def write_scannet_frames(scene: Scene, folder: Path) -> None:
     """The export of a ScanNet scan, in millimetres."""
-    assert scene.views is not None
     for index, (color, depth, pose) in enumerate(_frames(scene)):
         _picture(folder / "color" / f"{index}.png", color)
         _picture(folder / "depth" / f"{index}.png", _steps(depth, 1000))

@@ -108,7 +108,6 @@ def with_more(scene: Scene, means: np.ndarray, *, opacity: float) -> Scene:
 
 def permuted(scene: Scene, order: np.ndarray) -> Scene:
     """The same scene with its Gaussians in another order."""
-    assert scene.gaussians is not None
     features = scene.features["names"]
     moved = replace(features, features=features.features[order], weights=features.weights[order])
     return replace(scene, gaussians=scene.gaussians.select(order), features={"names": moved})

@@ -77,8 +77,6 @@ def box_views(cameras: Cameras | None = None, *, color_cameras: Cameras | None =
 
 def write_box(folder: Path, views: Views, *, millimeters: float = 1000.0) -> dict[str, Any]:
     """Writes views as a nerfstudio scene, 16-bit depth in steps of 1 / `millimeters`; returns its transforms.json."""
-    assert views.images is not None
-    assert views.depths is not None
     for name in ("images", "depth"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     frames = []

@@ -79,7 +79,6 @@ class DenseSideTeacher(SideTeacher):
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         coded = super().feature_map(views, view)
-        assert coded.codes is not None
         features = TABLE[coded.codes[::2, ::2]]
         return FeatureMap(features=features, grid_from_image=np.array([[0.5, 0, 0], [0, 0.5, 0]]), space=SPACE)
 

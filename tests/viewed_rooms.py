@@ -30,7 +30,6 @@ def room_scene() -> Scene:
 def name_features(scene: Scene, rename: dict[str, str] | None = None) -> tuple[GaussianFeatures, TextTable]:
     """Features that are the vector of the name of the object that a Gaussian lies in, with some noise; of the room
     itself what lies high was seen by no view."""
-    assert scene.gaussians is not None
     rng = np.random.default_rng(0)
     means = scene.gaussians.means
     numbers = object_numbers(means, scene.objects, scene.origin, 0.01)

@@ -96,9 +96,9 @@ def test_a_space_is_named_by_its_teacher_or_by_itself() -> None:
     assert spaces.resolve("second") == spaces.resolve("t") == "second"
     assert spaces.select("s") is spaces["first"]
     assert OutputSpaces(by_teacher={"only": space()}).resolve(None) == "only"
-    with pytest.raises(InputError, match=r"gives features of first, second; name one of them"):
+    with pytest.raises(InputError, match=r"features of first, second; name one of them"):
         spaces.resolve(None)
-    with pytest.raises(InputError, match=r"gives features of first, second; got 'third'"):
+    with pytest.raises(InputError, match=r"features of first, second; got 'third'"):
         spaces.resolve("third")
     with pytest.raises(InputError, match="one output space or more"):
         OutputSpaces(by_teacher={})
