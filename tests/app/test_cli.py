@@ -43,9 +43,7 @@ def test_help_lists_every_command_with_one_line(capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_of_a_command_lists_every_setting_with_default_and_meaning(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_of_a_command_lists_every_setting_with_default_and_meaning(name, capsys):
     from gsencoder.app.options import options_of
 
     assert cli.main([name, "--help"]) == 0
@@ -94,9 +92,7 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
         (["inspect", "a.ply", "quiet=x\ny"], "quiet: expected true or false"),
     ],
 )
-def test_a_wrong_command_line_is_one_line_and_exit_code_2(
-    words: list[str], problem: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_command_line_is_one_line_and_exit_code_2(words, problem, capsys):
     assert cli.main(words) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -154,9 +150,7 @@ def test_repair_keeps_positions_that_float32_cannot_hold(tmp_path: Path) -> None
     np.testing.assert_allclose(load_splat(tmp_path / "new.ply", origin=far).means, gaussians.means, atol=1e-6)
 
 
-def test_warnings_are_lines_on_stderr_and_entries_of_the_summary(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_warnings_are_lines_on_stderr_and_entries_of_the_summary(toy, tmp_path, capsys):
     def run(config: Any, summary: Any) -> None:
         for number in (1, 1, 2):
             warnings.warn(f"{number} images\nwere left out", SceneWarning, stacklevel=1)
@@ -185,10 +179,7 @@ def wrapped(stop: Stopped) -> SystemError:
         (OSError(28, "No space left on device"), 2, "error: standard output: no space left on the device\n"),
     ],
 )
-def test_what_ends_a_run_early_is_one_line(
-    toy: Any, error: BaseException, code: int, problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+def test_what_ends_a_run_early_is_one_line(toy, error, code, problem, tmp_path, capsys, monkeypatch):
     def run(config: Any, summary: Any) -> None:
         with output_folder(config.out):
             if isinstance(error, OSError):

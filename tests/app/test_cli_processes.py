@@ -116,7 +116,6 @@ def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code:
         stderr=subprocess.PIPE,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"writing\n"
         process.send_signal(number)
         assert process.communicate()[1] == problem

@@ -169,9 +169,7 @@ def test_secrets_are_never_shown() -> None:
     assert settings(_WithSecret()) == {"key": "", "name": ""}
 
 
-def test_secrets_are_repeated_by_no_error_and_taken_by_no_sweep(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_secrets_are_repeated_by_no_error_and_taken_by_no_sweep(tmp_path, capsys):
     for words, problem in (
         (["vlm.key=sk-first1", "vlm.key=sk-second2"], "vlm.key: given twice; give it once"),
         (["vlm.kee=sk-first1"], "vlm.kee: no such option"),

@@ -49,9 +49,7 @@ def union_members(cls: type, prefix: str = "") -> Iterator[tuple[str, type]]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.slow
-def test_every_member_of_every_choice_has_the_defaults_of_its_dataclass_and_the_default_one_changes_nothing(
-    command: str,
-) -> None:
+def test_every_member_of_every_choice_has_the_defaults_of_its_dataclass_and_the_default_one_changes_nothing(command):
     cls = config_of(command)
     choices = choices_of(cls)
     words = {

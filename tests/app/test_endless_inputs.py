@@ -87,9 +87,7 @@ def refusal(words: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> str
 
 
 @pytest.mark.parametrize("words", OPTIONS)
-def test_an_option_that_names_no_file_is_refused(
-    made: Path, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_option_that_names_no_file_is_refused(made, words, tmp_path, capsys):
     name = next(part for part in words.replace("=", " ").replace("/", " ").split() if part.startswith("BAD"))
     for part in ("room", "features", "tables", "truth"):
         (tmp_path / part).symlink_to(made / part)
@@ -99,9 +97,7 @@ def test_an_option_that_names_no_file_is_refused(
 
 
 @pytest.mark.parametrize(("words", "name"), CONTENTS)
-def test_a_file_of_a_scene_that_is_none_is_refused(
-    made: Path, words: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_of_a_scene_that_is_none_is_refused(made, words, name, tmp_path, capsys):
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     path = tmp_path / name
     path.unlink()

@@ -11,9 +11,7 @@ import pytest
 from gsencoder.app import main as cli
 
 
-def test_many_runs_sweep_numbers_and_keep_text(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_runs_sweep_numbers_and_keep_text(toy, tmp_path, capsys, monkeypatch):
     out = tmp_path / "o=${t},'s"
     words = ["toy", "-m", "a,b=", "size=1,2", "word=mug,banana", f"out={out}"]
     (tmp_path / "a,b=").touch()
@@ -54,10 +52,7 @@ def test_a_failed_run_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys:
         (["repair", "-m", "a.ply", "out=x.ply"], "-m: repair writes a file"),
     ],
 )
-def test_many_runs_complain_like_one(
-    toy: Any, words: list[str], problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+def test_many_runs_complain_like_one(toy, words, problem, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(words) == 2
     err = capsys.readouterr().err
@@ -76,10 +71,7 @@ def test_many_runs_complain_like_one(
         ),
     ],
 )
-def test_a_launcher_that_cannot_start_jobs_says_so_in_one_line(
-    toy: Any, words: list[str], problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+def test_a_launcher_that_cannot_start_jobs_says_so_in_one_line(toy, words, problem, tmp_path, monkeypatch, capsys):
     if "submitit" in words[0]:
         pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     monkeypatch.setenv("PATH", "")

@@ -51,9 +51,7 @@ def test_an_existing_folder_is_refused_unless_overwrite(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_kill_between_two_renames_loses_no_earlier_results(
-    overwrite: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_between_two_renames_loses_no_earlier_results(overwrite, tmp_path, monkeypatch):
     """Where names cannot be exchanged there is a moment in which no folder has the name."""
     monkeypatch.setattr(outputs, "_exchange", lambda *_: False)
     fill(tmp_path / "out", "old")
@@ -150,7 +148,6 @@ with output_folder(sys.argv[1]) as folder:
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_kill_leaves_no_output_folder_and_the_next_run_cleans_up(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path / "out")], stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         process.stdout.readline()
         process.send_signal(signal.SIGKILL)
         process.wait()

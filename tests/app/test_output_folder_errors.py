@@ -104,9 +104,7 @@ def test_a_mount_point_is_refused_before_the_work(tmp_path: Path, monkeypatch: p
     fill(tmp_path / "volume" / "out", "x")
 
 
-def test_an_output_that_the_system_does_not_let_go_is_named_and_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_output_that_the_system_does_not_let_go_is_named_and_kept(tmp_path, monkeypatch):
     fill(tmp_path / "out", "old")
 
     def refused(source: str | Path, *_: object) -> None:

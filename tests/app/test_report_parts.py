@@ -148,9 +148,7 @@ def test_features_have_the_figures_of_their_basis_or_none(page: Page) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*words have no box")
-def test_the_page_of_the_demo_counts_words_and_what_the_basis_costs(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_page_of_the_demo_counts_words_and_what_the_basis_costs(monkeypatch, tmp_path):
     monkeypatch.setattr(demo, "HtmlReport", Page)
     features = SCENE.features["names"]
     fusion = Fusion(features=features, views=(0,), depth_sources=(), config=FuseConfig(), teacher=PaletteTeacher())
@@ -213,9 +211,7 @@ def test_fusion_words_and_scores_have_pages_in_which_names_are_text(tmp_path: Pa
 SMALL = ("demo", "objects=2", "views=2", "width=64")
 
 
-def test_the_report_links_to_the_page_where_there_is_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_report_links_to_the_page_where_there_is_one(tmp_path, capsys, monkeypatch):
     def built() -> Bundle:
         return Bundle(script="/* the script */", style="")
 

@@ -50,9 +50,7 @@ def queue(tmp_path: Path, work: Work, names: str = "abcd", **options: Any) -> No
     Run("fuse", QueueConfig(out=tmp_path / "out", **options)).scenes(paths, "features", work)
 
 
-def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(tmp_path, capsys):
     first = Work("b", "d")
     with pytest.raises(InputError, match=r"2 of 4 scenes failed.*tries them again: .*/b, .*/d$"):
         queue(tmp_path, first)
@@ -110,9 +108,7 @@ def test_a_broken_limit_of_one_of_several_scenes_names_it_on_the_screen_and_stan
         assert json.loads((out / name / "summary.json").read_text())["warnings"] == [f"{broken} {seconds}"]
 
 
-def test_results_of_other_settings_are_neither_taken_nor_replaced(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_of_other_settings_are_neither_taken_nor_replaced(tmp_path, capsys):
     queue(tmp_path, Work())
     other = Work()
     with pytest.raises(InputError, match="4 of 4 scenes failed"):
@@ -126,9 +122,7 @@ def test_results_of_other_settings_are_neither_taken_nor_replaced(
     assert "summary.json: cannot be read" in capsys.readouterr().err
 
 
-def test_workers_begin_at_different_scenes_and_leave_alone_what_another_one_does(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_workers_begin_at_different_scenes_and_leave_alone_what_another_one_does(tmp_path, capsys):
     firsts = []
     for worker in range(4):
         work = Work()
@@ -143,9 +137,7 @@ def test_workers_begin_at_different_scenes_and_leave_alone_what_another_one_does
 
 
 @pytest.mark.parametrize("names", ["a", "ab"])
-def test_without_an_output_folder_results_lie_in_outputs(
-    tmp_path: Path, names: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_an_output_folder_results_lie_in_outputs(tmp_path, names, monkeypatch):
     monkeypatch.chdir(tmp_path)
     paths = [tmp_path / name for name in names]
     Run("fuse", QueueConfig()).scenes(paths, "features", Work())

@@ -1,7 +1,5 @@
 """Commands that several processes of a launcher start: those that share no work refuse, and write nothing."""
 
-from pathlib import Path
-
 import pytest
 from command_runs import refusal
 
@@ -19,18 +17,14 @@ def second_of_three(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", [each.name for each in COMMANDS.values() if not each.several])
-def test_a_command_without_work_to_share_says_so(
-    name: str, second_of_three: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_without_work_to_share_says_so(name, second_of_three, tmp_path, capsys):
     out = tmp_path / ("out.html" if name == "view" else "out")
     line = refusal(capsys, name, *GIVEN.get(name, ["scene"]), f"out={out}")
     assert line.startswith(f"error: {name}: runs in one process, and this is process 1 of 3")
     assert not out.exists()
 
 
-def test_one_scene_is_not_for_several_processes(
-    second_of_three: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_scene_is_not_for_several_processes(second_of_three, tmp_path, capsys):
     write_room(make_room(0, objects=1, views=2, width=40, height=30), tmp_path / "room")
     line = refusal(capsys, "fuse", str(tmp_path / "room"), "teacher=palette", f"out={tmp_path / 'out'}")
     assert "room: runs in one process, and this is process 1 of 3" in line

@@ -106,9 +106,7 @@ def test_a_run_that_was_killed_in_its_first_moments_does_not_block_the_next(tmp_
     assert not path.exists()
 
 
-def test_a_kill_while_the_folder_is_removed_leaves_one_that_is_known(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_while_the_folder_is_removed_leaves_one_that_is_known(tmp_path, monkeypatch):
     path = tmp_path / "run"
     cut_off(path, "a", "b", "z")
     removed, unlink = [], Path.unlink

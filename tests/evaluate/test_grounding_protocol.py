@@ -48,7 +48,6 @@ def labeled_room() -> tuple[Scene, GaussianFeatures]:
     """A room in which the cube is a mug; features are the words, exactly."""
     scene, cube = room()
     assert scene.gaussians is not None
-    assert scene.views is not None
     which = torch.zeros(len(scene.gaussians))
     which[cube] = 1
     cameras = scene.views.cameras
@@ -74,7 +73,6 @@ WORDS = make_text_table(["wall", "mug"], np.eye(2, dtype=np.float32), "words")
 def test_what_features_say_exactly_is_grounded_exactly() -> None:
     scene, features = labeled_room()
     pairs, small, _ = ground_scene(scene, features, WORDS, GroundingProtocol(min_pixels=5))
-    assert scene.views is not None
     assert len(pairs) + small == len(scene.views)
     assert [pair.view for pair in pairs] == [name for name in scene.views.names if name in {p.view for p in pairs}]
     assert min(pair.iou for pair in pairs) > 0.8
@@ -137,9 +135,7 @@ def results_of(folder: Path) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_the_command_writes_pairs_and_names_and_takes_features_of_folders(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_pairs_and_names_and_takes_features_of_folders(tmp_path, capsys):
     made = make_room(0, objects=4, views=4, width=120, height=90)
     write_room(made, tmp_path / "room_0")
     write_words(tmp_path / "words.safetensors", made)

@@ -41,7 +41,6 @@ def featured() -> tuple[Scene, GaussianFeatures]:
 def test_scores_are_pooled_cosines_of_rendered_pixels(pooling: Any, mode: Any) -> None:
     scene, features = featured()
     assert scene.gaussians is not None
-    assert scene.views is not None
     protocol = RetrievalProtocol(pooling=pooling, mode=mode)
     text_mean = TEXTS.mean(axis=0)
     directions = word_directions(TEXTS, text_mean, mode)
@@ -75,7 +74,6 @@ def test_a_memory_is_scored_by_what_pixels_attend_to() -> None:
     )
     memory = memory_of_features(features, bank, channels=2)
     assert scene.gaussians is not None
-    assert scene.views is not None
     directions = word_directions(TEXTS, TEXTS.mean(axis=0), "raw")
     protocol = RetrievalProtocol(mode="raw", pooling="mean")
     (scores,) = score_views(scene, features, [1], directions, protocol, memory=memory)
@@ -141,9 +139,7 @@ def test_the_files_that_evaluate_writes_have_the_scores_that_it_reports(home: Pa
     assert {row["scene_id"] for row in json.loads((tmp_path / "a" / "truth.json").read_text())} == {"room_0", "room_1"}
 
 
-def test_captions_that_do_not_fit_are_refused_before_features_are_made(
-    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_captions_that_do_not_fit_are_refused_before_features_are_made(home, tmp_path, capsys, monkeypatch):
     def refused(*more: str) -> str:
         return refusal(capsys, *words_of(home, tmp_path / "out", *more))
 

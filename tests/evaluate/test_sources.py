@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,9 +45,7 @@ def asked(source: FeatureSource) -> str:
 
 
 @pytest.mark.parametrize("name", ["a", "b", "c"])
-def test_the_space_is_that_which_is_named_or_that_of_the_words(
-    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_space_is_that_which_is_named_or_that_of_the_words(name, monkeypatch, tmp_path):
     encoder: Any = Stub()
     assert asked(encoder_source(encoder, space=name)) == name
     assert space_of_words(encoder, WORDS[name]) == name

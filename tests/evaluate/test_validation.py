@@ -40,7 +40,6 @@ def judged(
 
     def encode_spaces(*_: object, **__: object) -> dict[str, GaussianFeatures]:
         (scene,) = next(turn).parts
-        assert scene is not None
         values = answers(scene.targets(np.arange(len(scene))))  # type: ignore[operator]
         weights = np.ones(len(scene), np.float32)
         features = space.restore(values)
@@ -50,9 +49,7 @@ def judged(
     return validate_encoder(scenes, small_encoder(), outputs, {"sides": codebook})["sides"]
 
 
-def test_who_gives_the_targets_is_always_right(
-    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_gives_the_targets_is_always_right(walls, monkeypatch):
     results = judged(walls, monkeypatch, lambda targets: targets)
     assert results.score == 1
     assert results.cosine_named == pytest.approx(1, abs=1e-5)
@@ -60,9 +57,7 @@ def test_who_gives_the_targets_is_always_right(
     assert results.total.sum() == sum(int((part.weights > 0).sum()) for part in parts)
 
 
-def test_who_always_says_the_same_is_right_about_one_kind_and_who_says_the_opposite_about_none(
-    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_always_says_the_same_is_right_about_one_kind_and_who_says_the_opposite_about_none(walls, monkeypatch):
     codebook = walls[2]
     results = judged(walls, monkeypatch, lambda targets: np.broadcast_to(codebook[1], targets.shape).copy())
     assert results.accuracies()[1] == 1
@@ -77,15 +72,12 @@ def test_an_encoder_is_drawn_beside_the_truth(walls: tuple[list[TrainingScene], 
     scenes, outputs, codebook = walls
     config = EncodeConfig(precision="float32")
     accuracy = validate_encoder(scenes, small_encoder(), outputs, {"sides": codebook}, config, pictured=1)["sides"]
-    assert accuracy.sheet is not None
     assert accuracy.sheet.shape[2] == 3
     assert len(np.unique(accuracy.sheet.reshape(-1, 3), axis=0)) > 10
 
 
 @pytest.mark.slow
-def test_teachers_are_scored_together_as_each_alone_over_the_scenes_that_have_them(
-    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray],
-) -> None:
+def test_teachers_are_scored_together_as_each_alone_over_the_scenes_that_have_them(walls):
     scenes, outputs, codebook = walls
     first, second = (part for scene in scenes for part in scene.parts)
     sides, encoder = outputs["sides"], small_encoder((outputs.channels, outputs.channels))

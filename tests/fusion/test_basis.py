@@ -107,9 +107,7 @@ def test_bad_vectors_are_refused() -> None:
 
 
 @pytest.mark.parametrize("most", [1, 2, 23, 24, 100])
-def test_no_more_components_are_taken_than_allowed_and_it_is_told_what_they_keep(
-    rng: np.random.Generator, most: int
-) -> None:
+def test_no_more_components_are_taken_than_allowed_and_it_is_told_what_they_keep(rng, most):
     moments = moments_of(low_rank(rng, noise=0.5))
     values = np.sort(np.linalg.eigvalsh(moments.covariance()))[::-1]
     basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=1.0, max_rank=most)

@@ -143,9 +143,7 @@ def test_more_seconds_are_more_views(rng: np.random.Generator) -> None:
     assert numbers[0] < numbers[-1] == 16
 
 
-def test_where_error_and_other_budgets_conflict_the_error_is_kept_and_each_conflict_named(
-    rng: np.random.Generator,
-) -> None:
+def test_where_error_and_other_budgets_conflict_the_error_is_kept_and_each_conflict_named(rng):
     scene, teacher = make_scene(count=6), FixedTeacher(alike(6, 0.3, rng))
     made = fuse_within(scene, teacher, BASE, FusionBudget(error=0.01, seconds=1e-9, megabytes=1e-6))
     assert kept_error(scene, teacher, made) <= 0.01

@@ -18,9 +18,7 @@ OPEN = VisibilityConfig(against=())
 
 
 @pytest.mark.parametrize("depth", [False, True])
-def test_sampled_rays_have_the_weights_of_b_at_their_pixels(
-    depth: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sampled_rays_have_the_weights_of_b_at_their_pixels(depth, rng, monkeypatch):
     monkeypatch.setattr(lift, "RAYS", 100)
     depths = [rng.uniform(1.5, 3.0, (24, 33)).astype(np.float32) for _ in range(5)]
     masks = [rng.uniform(size=(24, 33)) > 0.3 for _ in range(5)]

@@ -133,9 +133,7 @@ def test_a_moved_splat_has_the_colors_that_it_had_from_there(degree: int) -> Non
 
 
 @pytest.mark.parametrize("number", [0, 2])
-def test_a_usual_frame_is_refused_and_its_advice_mends_it(
-    scene: Scene, field_room: FieldRoom, tmp_path: Path, number: int
-) -> None:
+def test_a_usual_frame_is_refused_and_its_advice_mends_it(scene, field_room, tmp_path, number):
     frame = FRAMES[number]
     if frame.intrinsics_factor != 1:
         content = field_room.transforms()
@@ -163,9 +161,7 @@ def test_a_usual_frame_is_refused_and_its_advice_mends_it(
     assert len(messages) == 1
 
 
-def test_a_splat_in_the_world_of_nerfstudio_is_moved_as_its_file_says(
-    scene: Scene, field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_a_splat_in_the_world_of_nerfstudio_is_moved_as_its_file_says(scene, field_room, tmp_path):
     """nerfstudio's transform leads from the world before `applied_transform`, which that of the cameras is after."""
     turn = SplatFrame(name="t", rotation=np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), shift=np.zeros(3))
     applied = (turn.rotation[:, [0, 1, 2, 2]] * [1, 1, 1, 0]).tolist()

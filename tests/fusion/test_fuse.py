@@ -51,9 +51,7 @@ def test_a_constant_map_gives_a_constant_feature() -> None:
 
 
 @pytest.mark.parametrize("teacher", ["coded", "cheap", "costly"])
-def test_the_number_of_threads_does_not_change_a_bit(
-    teacher: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_number_of_threads_does_not_change_a_bit(teacher, rng, monkeypatch):
     """Nor does sensor depth, which hides some Gaussians; views of a cheap teacher are prepared side by side."""
     depths = [rng.uniform(1.5, 3.0, (24, 32)).astype(np.float32) for _ in range(9)]
     scene, maps = make_scene(count=9, depths=depths), random_maps(rng, 9)
@@ -76,9 +74,7 @@ def test_the_number_of_threads_does_not_change_a_bit(
         assert (other.features.mean == results[0].features.mean).all()
 
 
-def test_a_narrow_teacher_keeps_all_channels_and_a_wide_one_a_basis(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_narrow_teacher_keeps_all_channels_and_a_wide_one_a_basis(rng, monkeypatch):
     for narrow in (SPACE.channels, SPACE.channels - 1):
         monkeypatch.setattr(sys.modules["gsencoder.fusion.fuse"], "NARROW", narrow)
         features = fuse(make_scene(), FixedTeacher(random_maps(rng))).features
@@ -123,9 +119,7 @@ def test_the_center_lift_sees_a_hidden_wall_unless_an_occlusion_test_hides_it(ag
         ("center", False, ("rendered",)),
     ],
 )
-def test_the_automatic_test_takes_the_depth_that_there_is(
-    lift: str, sensor: bool, tested: tuple[str, ...], rng: np.random.Generator
-) -> None:
+def test_the_automatic_test_takes_the_depth_that_there_is(lift, sensor, tested, rng):
     depths = {"depths": [np.full((24, 32), 2.0, np.float32)]} if sensor else {}
     scene = make_scene(count=1, gaussians=two_walls(), **depths)
     config = FuseConfig(lift=lift, energy=1.0)  # type: ignore[arg-type]

@@ -48,9 +48,7 @@ def test_cells_without_a_vector_give_neither_features_nor_weight(rng: np.random.
 
 
 @pytest.mark.parametrize("form", ["codes", "shares"])
-def test_shares_are_masked_in_part_and_codes_where_most_of_their_cell_is_out(
-    rng: np.random.Generator, form: str
-) -> None:
+def test_shares_are_masked_in_part_and_codes_where_most_of_their_cell_is_out(rng, form):
     shape, space = (HEIGHT // STRIDE, WIDTH // STRIDE), FeatureSpace(name="s", channels=2)
     affine, table = np.array([[1 / STRIDE, 0, 0], [0, 1 / STRIDE, 0]]), rng.normal(size=(3, 2)).astype(np.float32)
     mask = np.zeros((*shape, STRIDE * STRIDE), bool)
@@ -74,9 +72,7 @@ def test_shares_are_masked_in_part_and_codes_where_most_of_their_cell_is_out(
 
 @pytest.mark.parametrize("rank", [None, 2])
 @pytest.mark.parametrize("form", ["codes", "shares", "own tables"])
-def test_many_codes_are_lifted_as_vectors_with_the_same_result(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, form: str, rank: int | None
-) -> None:
+def test_many_codes_are_lifted_as_vectors_with_the_same_result(rng, monkeypatch, form, rank):
     shape, space = (HEIGHT // STRIDE, WIDTH // STRIDE), FeatureSpace(name="s", channels=4)
     table, affine = rng.normal(size=(9, 4)).astype(np.float32), np.array([[1 / STRIDE, 0, 0], [0, 1 / STRIDE, 0]])
     basis = None
@@ -165,9 +161,7 @@ def test_a_cell_has_no_more_rays_than_pixels(across: float, down: float, rays: i
 
 
 @pytest.mark.parametrize("coded", [False, True])
-def test_sums_are_divided_by_their_weights_and_rows_of_hardly_any_weight_are_zero(
-    rng: np.random.Generator, coded: bool
-) -> None:
+def test_sums_are_divided_by_their_weights_and_rows_of_hardly_any_weight_are_zero(rng, coded):
     table = rng.normal(size=(3, 2)).astype(np.float32)
     shares = np.array([[1, 2, 3], [0, 0, 0], [0, 1e-39, 0], [0.5, 0, 0.25]], np.float32)
     sums = FeatureSums(4, FeatureSpace(name="s", channels=2), None, table if coded else None)
@@ -204,9 +198,7 @@ def entries(b: Blend) -> set[tuple[int, int]]:
 
 
 @pytest.mark.parametrize(("relative", "absolute"), [(0.1, 0.0), (0.0, 0.3), (0.1, 0.2), (1.0, 0.0), (0.0, 9.0)])
-def test_an_entry_stays_if_its_depth_is_among_those_that_its_rows_rays_meet(
-    rng: np.random.Generator, relative: float, absolute: float
-) -> None:
+def test_an_entry_stays_if_its_depth_is_among_those_that_its_rows_rays_meet(rng, relative, absolute):
     b = patches()
     depth = rng.uniform(2, 4, (DOWN, ACROSS)).astype(np.float32)
     # Rays without depth, and a row of them alone, which lets nothing pass whatever the tolerance.

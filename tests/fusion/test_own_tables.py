@@ -68,9 +68,7 @@ def scene_of(masks: list[np.ndarray] | None = None) -> Scene:
 
 @pytest.mark.parametrize("lift", ["blend", "center"])
 @pytest.mark.parametrize("masked", [False, True])
-def test_fusing_codes_with_tables_of_their_own_equals_fusing_their_vectors(
-    rng: np.random.Generator, lift: Any, masked: bool
-) -> None:
+def test_fusing_codes_with_tables_of_their_own_equals_fusing_their_vectors(rng, lift, masked):
     scene = scene_of([rng.random(SIZE) < 0.7 for _ in REGIONS] if masked else None)
     config = FuseConfig(lift=lift, basis=False, visibility=VisibilityConfig(against=()))
     seed = rng.integers(1000)
@@ -91,9 +89,7 @@ def test_each_region_counts_once_however_many_pixels_it_has(rng: np.random.Gener
     np.testing.assert_allclose(fused.mean, rows.mean(axis=0), atol=1e-5)
 
 
-def test_maps_with_tables_of_their_own_are_made_once_and_read_as_they_were(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_maps_with_tables_of_their_own_are_made_once_and_read_as_they_were(tmp_path, rng):
     teacher = OwnTables(rng, dense=False, cheap=False)
     cached = CachedTeacher(teacher, tmp_path)
     views = scene_of().views

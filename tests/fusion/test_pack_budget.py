@@ -119,9 +119,7 @@ def test_the_size_that_is_planned_is_that_of_the_file(pack: Pack) -> None:
         assert 0.016 - step <= size <= 0.016
 
 
-def test_a_budget_is_refused_beside_what_it_chooses_and_where_nothing_can_be_chosen(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_budget_is_refused_beside_what_it_chooses_and_where_nothing_can_be_chosen(folder, tmp_path, capsys):
     for words, message in (
         (["form=index", "index.threshold=0.8"], "index.threshold=0.8: is chosen by budget.error"),
         (["form=index", "index.threshold=0", "index.rows=9"], "index.threshold=0: is chosen by budget.error"),
@@ -138,9 +136,7 @@ def test_an_error_by_its_short_name_is_the_budget(pack: Pack) -> None:
     assert pack()["error"] <= 0.01
 
 
-def test_an_error_that_no_table_reaches_is_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_that_no_table_reaches_is_refused(folder, tmp_path, capsys, monkeypatch):
     indexed = index_budget._indexed
     monkeypatch.setattr(index_budget, "_indexed", lambda scene, at, most=None: indexed(scene, at, most and 300))
     out = f"out={tmp_path / 'out'}"

@@ -199,9 +199,7 @@ def test_pack_writes_what_localize_reads(folder: Path, tmp_path: Path, capsys: p
         (["form=pt"], "form"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
+def test_settings_that_cannot_be_are_refused(folder, tmp_path, capsys, words, message):
     assert cli.main(["pack", str(folder), f"out={tmp_path / 'out'}", *words]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

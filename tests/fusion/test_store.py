@@ -116,9 +116,7 @@ def changed(path: Path, **arrays: np.ndarray) -> None:
         ("components", np.full((3, 8), np.inf, np.float32), "24 of 24 values of components are not finite"),
     ],
 )
-def test_features_that_do_not_belong_together_are_named(
-    tmp_path: Path, name: str, values: np.ndarray, problem: str
-) -> None:
+def test_features_that_do_not_belong_together_are_named(tmp_path, name, values, problem):
     save_features(tmp_path, make_scene(), make_features(), {})
     changed(tmp_path / FEATURES_FILE, **{name: values})
     with pytest.raises(InputError, match=f"{FEATURES_FILE}: .*({problem})"):

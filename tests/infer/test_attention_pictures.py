@@ -75,9 +75,7 @@ def strongest(
 
 
 @pytest.mark.parametrize(("view", "pixel"), [(0, (24, 20)), (1, (18, 11))])
-def test_the_components_are_the_first_of_the_attention_of_the_pixels_query(
-    memory: QueryMemory, scene: Scene, view: int, pixel: tuple[int, int]
-) -> None:
+def test_the_components_are_the_first_of_the_attention_of_the_pixels_query(memory, scene, view, pixel):
     b = blend(scene.gaussians, scene.views.cameras, view)
     seen = torch.from_numpy((memory.weights > 0).astype(np.float32))
     row = pixel[1] * b.shape[1] + pixel[0]
@@ -218,9 +216,7 @@ def test_entropy_is_none_for_one_component_and_largest_for_equal_ones() -> None:
     np.testing.assert_allclose(attention_entropy(weights), [0, np.log(4), np.log(2)], atol=1e-6)
 
 
-def test_the_salient_pixel_is_opaque_and_has_the_lowest_entropy_of_the_middle(
-    memory: QueryMemory, scene: Scene
-) -> None:
+def test_the_salient_pixel_is_opaque_and_has_the_lowest_entropy_of_the_middle(memory, scene):
     b = blend(scene.gaussians, scene.views.cameras, 0)
     pixel = salient_pixel(memory, b)
     x, y = pixel
@@ -235,9 +231,7 @@ def test_the_salient_pixel_is_opaque_and_has_the_lowest_entropy_of_the_middle(
     assert salient_pixel(unseen, b) is None
 
 
-def test_where_only_the_rim_of_a_view_shows_something_the_salient_pixel_is_there(
-    memory: QueryMemory, scene: Scene
-) -> None:
+def test_where_only_the_rim_of_a_view_shows_something_the_salient_pixel_is_there(memory, scene):
     corner = (scene.gaussians.means[:, 0] < -0.75) & (memory.weights > 0)
     weights = np.where(corner, memory.weights, 0).astype(np.float32)
     rim = replace(memory, weights=weights, queries=np.where(corner[:, None], memory.queries, 0).astype(np.float32))
@@ -273,9 +267,7 @@ def test_sources_of_the_walls_bank_are_cells_of_two_pixels(memory: QueryMemory) 
 
 
 @pytest.mark.parametrize("case", ["haze", "below the middle", "beside the middle"])
-def test_the_salient_pixel_is_opaque_and_in_the_middle_though_others_attend_to_less(
-    memory: QueryMemory, case: str
-) -> None:
+def test_the_salient_pixel_is_opaque_and_in_the_middle_though_others_attend_to_less(memory, case):
     """One Gaussian in the middle attends to all components, and another one to a single component."""
     scene = wall(0)
     positions = {"haze": (0.4, 0.0, 3.0), "below the middle": (0.0, 0.95, 3.0), "beside the middle": (1.1, 0.0, 3.0)}[

@@ -47,9 +47,7 @@ def test_the_spacing_of_a_grid_is_its_step_whatever_the_order_and_the_duplicates
     assert scene_spacing(np.concatenate([shuffled, shuffled, shuffled])) == pytest.approx(0.02, rel=1e-4)
 
 
-def test_the_spacing_of_a_sample_does_not_depend_on_order(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_spacing_of_a_sample_does_not_depend_on_order(rng, monkeypatch):
     points = rng.random((4000, 3)).astype(np.float32)
     whole = scene_spacing(points)
     monkeypatch.setattr("gsencoder.data.seeding.points.SPACING_SAMPLE", 500)
@@ -63,9 +61,7 @@ def test_points_in_one_place_have_no_spacing(count: int) -> None:
     assert scene_spacing(np.full((count, 3), 1.5, np.float32)) == 0
 
 
-def test_clusters_on_the_grid_are_those_of_dbscan_on_a_surface(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clusters_on_the_grid_are_those_of_dbscan_on_a_surface(rng, monkeypatch):
     centers = rng.random((30, 3)) * 4
     points = (centers[rng.integers(0, 30, 6000)] + rng.normal(0, 0.03, (6000, 3))).astype(np.float32)
     exact = cluster(points, 0.08, 3)
@@ -110,9 +106,7 @@ def test_floaters_are_dropped_by_their_share_of_the_best_clusters_weight() -> No
     st.sampled_from([1e-4, 1.0, 1e3]),
 )
 @settings(deadline=None, max_examples=60)
-def test_boxes_hold_their_points_and_have_sides_of_no_negative_length(
-    count: int, shape: str, seed: int, upright: bool, size: float
-) -> None:
+def test_boxes_hold_their_points_and_have_sides_of_no_negative_length(count, shape, seed, upright, size):
     rng = np.random.default_rng(seed)
     flattened = {
         "volume": [1, 1, 1],
@@ -180,9 +174,7 @@ def test_sigma_boxes_bound_the_ellipsoids(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("mean", [0.5, 0.0, -0.5])
-def test_clusters_are_scored_by_their_weighted_mean_and_the_fourth_root_of_their_share(
-    rng: np.random.Generator, mean: float
-) -> None:
+def test_clusters_are_scored_by_their_weighted_mean_and_the_fourth_root_of_their_share(rng, mean):
     """Of a negative mean the root is divided by: a small share is never an advantage."""
     labels, rows = rng.integers(-1, 4, 300), 10 + rng.permutation(300)
     scores, weights = (mean + rng.normal(0, 0.1, 300)).astype(np.float32), rng.random(300).astype(np.float32)

@@ -107,9 +107,7 @@ def test_the_title_states_how_many_features_are_drawn_and_how_many_are_covered()
     assert _title(bank_of(np.eye(1, 3)), sample_of(np.ones((1, 3))))[1] == "1 component for 1 raw feature"
 
 
-def test_umap_is_given_the_directions_that_the_bank_compares_and_its_dots_are_told_apart(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_umap_is_given_the_directions_that_the_bank_compares_and_its_dots_are_told_apart(monkeypatch):
     rng = np.random.default_rng(0)
     mean = np.array([5, 0, 0, 0], np.float32)
     raw, components = (rng.normal(size=(count, 4)).astype(np.float32) + mean for count in (50, 7))

@@ -53,9 +53,7 @@ class Recording(TorchNetwork):
 
 @given(st.integers(1, 300), st.integers(1, 80), st.floats(0, 2), st.integers(0, 3))
 @settings(max_examples=60)
-def test_every_gaussian_is_some_chunks_own_once_and_no_chunk_is_too_large(
-    count: int, chunk: int, halo: float, seed: int
-) -> None:
+def test_every_gaussian_is_some_chunks_own_once_and_no_chunk_is_too_large(count, chunk, halo, seed):
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(count, 3)).astype(np.float32)
     means[: count // 3] = 0.5  # Coincident ones cannot be cut apart by a plane.
@@ -91,9 +89,7 @@ def plain_cut(means: np.ndarray, chunk: int, halo: float) -> list[tuple[list[int
 
 @pytest.mark.parametrize(("chunk", "halo"), [(200, 0.0), (200, 0.3), (300, 2.0), (50, 0.2), (2000, 0.3)])
 @pytest.mark.parametrize("ties", [False, True])
-def test_a_scene_is_cut_as_by_sorting_it_and_looking_at_all_rows_for_each_box(
-    chunk: int, halo: float, ties: bool
-) -> None:
+def test_a_scene_is_cut_as_by_sorting_it_and_looking_at_all_rows_for_each_box(chunk, halo, ties):
     means = np.random.default_rng(0).normal(size=(1500, 3)).astype(np.float32) * np.float32([3, 2, 1])
     if ties:
         means = np.round(means * 2) / 2
@@ -162,9 +158,7 @@ def test_a_halo_is_as_many_metres_wide_in_every_unit_of_length() -> None:
     assert [len(part) for part in seen_by(one, config)] == [len(part) for part in seen_by(quarters, config, 0.25)]
 
 
-def test_chunks_that_take_many_times_the_work_of_a_scene_are_warned_of_with_their_figures(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_chunks_that_take_many_times_the_work_of_a_scene_are_warned_of_with_their_figures(monkeypatch):
     one = random_gaussians(1500)
     seen_by(one, EncodeConfig(chunk=200, halo=0.25), 0.5)
     monkeypatch.setattr(module, "MUCH_WORK", 10_000)

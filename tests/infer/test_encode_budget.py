@@ -58,9 +58,7 @@ def measured(made: BudgetEncoding, gaussians: Gaussians, encoder: Encoder) -> fl
 
 
 @pytest.mark.parametrize("config", [IN_CHUNKS, EncodeConfig()], ids=["chunks", "whole"])
-def test_a_limit_of_error_is_kept_and_a_looser_one_never_costs_more(
-    gaussians: Gaussians, encoder: Encoder, config: EncodeConfig
-) -> None:
+def test_a_limit_of_error_is_kept_and_a_looser_one_never_costs_more(gaussians, encoder, config):
     sample = SampledEncoding(gaussians, encoder, exact_encoding(config), 1.0)
     chosen = []
     for error in (1e-7, 1e-3, 0.02, 0.5):
@@ -71,9 +69,7 @@ def test_a_limit_of_error_is_kept_and_a_looser_one_never_costs_more(
     assert chosen[-1] == 0 < chosen[0]
 
 
-def test_megabytes_are_kept_and_more_of_them_are_no_less_exact(
-    gaussians: Gaussians, encoder: Encoder, tmp_path: Path
-) -> None:
+def test_megabytes_are_kept_and_more_of_them_are_no_less_exact(gaussians, encoder, tmp_path):
     full = features_bytes(encoder.spaces["labels"], len(gaussians), 4) / 1e6
     errors, ranks = [], []
     for size in (0.8 * full, 0.9 * full, 2 * full):
@@ -89,27 +85,21 @@ def test_megabytes_are_kept_and_more_of_them_are_no_less_exact(
     assert errors[-1] == pytest.approx(0, abs=1e-6)
 
 
-def test_megabytes_that_nothing_fits_into_are_refused_with_those_that_something_does(
-    gaussians: Gaussians, encoder: Encoder
-) -> None:
+def test_megabytes_that_nothing_fits_into_are_refused_with_those_that_something_does(gaussians, encoder):
     with pytest.raises(InputError, match="^budget.megabytes=0.005: the smallest result takes ") as refused:
         within(gaussians, encoder, megabytes=0.005)
     smallest = float(str(refused.value).split("takes ")[1].split(" MB;")[0])
     assert within(gaussians, encoder, megabytes=smallest).ranks == {"labels": 1}
 
 
-def test_where_error_and_other_budgets_conflict_the_error_is_kept_and_each_conflict_named(
-    gaussians: Gaussians, encoder: Encoder
-) -> None:
+def test_where_error_and_other_budgets_conflict_the_error_is_kept_and_each_conflict_named(gaussians, encoder):
     made = within(gaussians, encoder, error=1e-3, seconds=1e-9, megabytes=1e-6)
     assert measured(made, gaussians, encoder) <= 1e-3
     assert [note.split(" takes")[0] for note in made.notes] == ["budget.error=0.001"] * 2
     assert ["budget.seconds" in made.notes[0], "budget.megabytes" in made.notes[1]] == [True, True]
 
 
-def test_rooms_that_are_far_apart_are_chosen_for_as_they_are_encoded_and_each_as_if_alone(
-    gaussians: Gaussians, encoder: Encoder
-) -> None:
+def test_rooms_that_are_far_apart_are_chosen_for_as_they_are_encoded_and_each_as_if_alone(gaussians, encoder):
     """Of two that fit into a chunk each, and not together, there is nothing to cut; of a larger chunk's there is."""
     names = ("means", "quats", "scales", "opacities", "sh")
     far = replace(gaussians, means=gaussians.means + np.float32([1000, 0, 0]))
@@ -140,9 +130,7 @@ class Clock:
         return self.now
 
 
-def test_seconds_are_kept_and_more_of_them_are_no_less_exact(
-    gaussians: Gaussians, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_seconds_are_kept_and_more_of_them_are_no_less_exact(gaussians, encoder, monkeypatch):
     clock, errors = Clock(encoder, monkeypatch), []
     for seconds in (9.0, 16.0, 1000.0):
         budget = EncodeBudget(seconds=seconds)
@@ -157,9 +145,7 @@ def test_seconds_are_kept_and_more_of_them_are_no_less_exact(
     assert "the fastest setting takes about" in made.notes[0]
 
 
-def test_a_small_scene_is_encoded_exactly_without_a_choice(
-    gaussians: Gaussians, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_small_scene_is_encoded_exactly_without_a_choice(gaussians, encoder, monkeypatch):
     monkeypatch.setattr(module, "SMALL_SCENE", len(gaussians) + 1)
     made = within(gaussians, encoder, EncodeConfig(), error=0.5)
     assert made.choice.setting == made.exact
@@ -182,9 +168,7 @@ def splat(tmp_path: Path) -> Path:
 
 @pytest.mark.usefixtures("encoder")
 @pytest.mark.parametrize("check", [True, False])
-def test_the_command_prints_and_records_each_limit_and_what_became_of_it(
-    splat: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], check: bool
-) -> None:
+def test_the_command_prints_and_records_each_limit_and_what_became_of_it(splat, weights, tmp_path, capsys, check):
     out = tmp_path / "out"
     words = [str(splat), f"weights={weights}", "data.metres_per_unit=1", f"out={out}", f"budget.check={check}"]
     assert cli.main(["encode", *words, "budget.error=0.05", "budget.megabytes=1"]) == 0
@@ -282,9 +266,7 @@ def test_a_splat_in_other_units_of_length_gets_the_same_setting_and_the_same_err
     assert made[0] == made[1]
 
 
-def test_the_error_that_is_predicted_is_near_that_of_the_worst_teacher(
-    gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_error_that_is_predicted_is_near_that_of_the_worst_teacher(gaussians, monkeypatch):
     """Parts as large as the scene predict best."""
     monkeypatch.setattr(module, "LEAST_ROWS", len(gaussians))
     monkeypatch.setattr(NearSighted, "precisions", lambda *_: ("float32",))
@@ -308,9 +290,7 @@ def test_seconds_of_a_first_pass_that_loads_kernels_are_not_predicted_for_later_
     assert seconds(500.0) == seconds(1.0)
 
 
-def test_a_small_scene_has_all_precisions_to_choose_among_where_seconds_are_limited(
-    gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_small_scene_has_all_precisions_to_choose_among_where_seconds_are_limited(gaussians, monkeypatch):
     monkeypatch.setattr(module, "SMALL_SCENE", len(gaussians) + 1)
     whole = replace(EXACT, chunk=0)
     timed, untimed = sampled(gaussians, whole, clock=lambda: 0.0), sampled(gaussians, whole)
@@ -335,9 +315,7 @@ def test_megabytes_are_those_of_the_files_of_all_teachers_together(gaussians: Ga
     assert (ranks[0], ranks[-1]) == ((1, 1), (4, 4))
 
 
-def test_a_setting_and_the_coordinates_left_out_share_the_limit_of_error(
-    gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_setting_and_the_coordinates_left_out_share_the_limit_of_error(gaussians, monkeypatch):
     monkeypatch.setattr(module, "SMALL_SCENE", 0)
     for error in (0.05, 0.2, 0.45):
         made = encode_within(

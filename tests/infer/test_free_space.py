@@ -19,9 +19,7 @@ def free() -> FreeSpace:
     return FreeSpace(scene.gaussians).seen_by(corner_cameras()).without(rows)
 
 
-def test_points_in_the_room_are_seen_empty_and_those_beyond_its_walls_are_not(
-    free: FreeSpace, rng: np.random.Generator
-) -> None:
+def test_points_in_the_room_are_seen_empty_and_those_beyond_its_walls_are_not(free, rng):
     inside = rng.uniform((-1.2, -1.2, 0.3), (1.2, 1.2, 1.3), (200, 3))
     inside = inside[np.abs(inside - (0.3, 0.2, 0.8)).max(axis=1) > 0.5]
     assert free.seen_empty(inside).mean() > 0.97
@@ -123,9 +121,7 @@ def test_small_gaussians_stay_as_they_are(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("scales", [(1.0, 1.0, 0.001), (1.0, 0.01, 0.01), (1.0, 0.5, 0.25)])
-def test_every_point_of_a_gaussian_is_near_a_patch_and_no_patch_leaves_it(
-    scales: tuple[float, float, float], rng: np.random.Generator
-) -> None:
+def test_every_point_of_a_gaussian_is_near_a_patch_and_no_patch_leaves_it(scales, rng):
     edge = 0.2
     whole = one(scales, rng.normal(size=4), (3.0, -2.0, 1.0))
     parts = patches(whole, edge)

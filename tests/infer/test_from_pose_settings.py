@@ -14,7 +14,6 @@ from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, from_pose
 from gsencoder.infer.relevancy import GaussianProducts, Mode, ThresholdConfig, relevancy, word_directions
 from gsencoder.render import blend
 from gsencoder.types import Scene
-from gsencoder.types.features import Scoring
 
 WORDS = NAMES[:3]
 MODES: list[Mode] = ["centered", "raw"]
@@ -56,9 +55,7 @@ def test_cosines_at_pixels_and_thresholds_are_centered_or_raw_as_they_are_asked_
     ("mode", "scoring", "components"),
     [("centered", "centered", 9), ("raw", "cosine", 9), ("centered", "dot", 90), ("raw", "centered", 90)],
 )
-def test_a_memory_is_compared_by_centered_or_by_raw_cosines_however_its_queries_are(
-    mode: Mode, scoring: Scoring, components: int
-) -> None:
+def test_a_memory_is_compared_by_centered_or_by_raw_cosines_however_its_queries_are(mode, scoring, components):
     scene, text = small_scene(), words()
     memory = memory_of(300, scoring=scoring, components=components)
     field = FeatureField(replace(scene, features={}), memory=memory, config=FromPoseConfig(mode=mode, stride=1))

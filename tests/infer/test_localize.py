@@ -110,7 +110,6 @@ def test_a_spacing_that_was_computed_before_gives_the_same_boxes() -> None:
 
 
 def test_the_order_of_the_gaussians_does_not_matter(rng: np.random.Generator) -> None:
-    assert SCENE.gaussians is not None
     order, fused = rng.permutation(len(SCENE.gaussians)), SCENE.features["toy"]
     features = replace(fused, features=fused.features[order], weights=fused.weights[order])
     moved = replace(SCENE, gaussians=SCENE.gaussians.select(order), features={"toy": features})
@@ -164,9 +163,7 @@ def test_every_kind_of_threshold_finds_the_chairs(kind: str) -> None:
     assert any(np.linalg.norm(localization.boxes[0].center - center) < 0.05 for center in PLACES["chair"])
 
 
-def test_contrast_finds_words_and_counts_the_negative_words_that_the_table_lacks(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_contrast_finds_words_and_counts_the_negative_words_that_the_table_lacks(monkeypatch):
     config = LocalizeConfig(contrast=True, threshold=ThresholdConfig(kind="fixed", fixed=0.8))
     with pytest.warns(SceneWarning, match="negative words that toy does not know .*the mean of its words stands"):
         localization = localize(SCENE, ["mug", "lamp"], TABLE, config)
@@ -180,7 +177,6 @@ def test_contrast_finds_words_and_counts_the_negative_words_that_the_table_lacks
 def test_a_scene_of_coincident_gaussians_is_one_place() -> None:
     n = 4
     gaussians = make_room_scene().gaussians
-    assert gaussians is not None
     piled = replace(gaussians.select(np.arange(n)), means=np.ones((n, 3), np.float32))
     vectors = np.tile(TABLE.embeddings[:1], (n, 1))
     fused = replace(SCENE.features["toy"], features=vectors, weights=np.ones(n, np.float32))

@@ -43,13 +43,7 @@ def test_the_command_tells_what_it_compared(folder: Path) -> None:
         ([], "out= is missing"),
     ],
 )
-def test_the_command_refuses_before_it_begins(
-    words: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_refuses_before_it_begins(words, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken.onnx").touch()
     assert cli.main(["export", *words]) == 2

@@ -40,9 +40,7 @@ def test_the_graph_gives_the_features_of_queries(scoring: str) -> None:
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_a_graph_that_differs_is_refused_also_where_no_gaussian_has_a_query(
-    monkeypatch: pytest.MonkeyPatch, seen: bool
-) -> None:
+def test_a_graph_that_differs_is_refused_also_where_no_gaussian_has_a_query(monkeypatch, seen):
     memory = make_memory()
     if not seen:
         memory = replace(memory, queries=np.zeros_like(memory.queries), weights=np.zeros_like(memory.weights))

@@ -71,18 +71,14 @@ def build(network: TorchNetwork, lowered: Any) -> Callable[[Any], bytes]:
         ("int8_dynamic", 0.99, 0.65),
     ],
 )
-def test_a_cheaper_precision_is_smaller_and_close(
-    build: Callable[[Any], bytes], exact: bytes, precision: Any, least: float, largest: float
-) -> None:
+def test_a_cheaper_precision_is_smaller_and_close(build, exact, precision, least, largest):
     model = build(precision)
     assert len(model) < largest * len(exact)
     runtime = Encoder(OnnxNetwork(model, device="cpu"))
     assert runtime.network.header.precision == precision
     (cosine,) = check_cosines(model, exact, [CLOUD], cosine=least).values()
     assert cosine < 1 - 1e-9
-    assert runtime.words is not None
     full = Encoder(OnnxNetwork(exact, device="cpu"))
-    assert full.words is not None
     np.testing.assert_allclose(runtime.words.embeddings, full.words.embeddings, atol=0.02)
     for count in (1, 2, 40):
         cloud = random_cloud(count, 0.05)
@@ -173,13 +169,7 @@ def test_rounded_columns_are_within_half_a_step(most: int) -> None:
     assert (scale > 0).all()
 
 
-def test_the_command_judges_what_it_writes(
-    exported: Path,
-    lowered: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_judges_what_it_writes(exported, lowered, tmp_path, monkeypatch, capsys):
     save_splat(tmp_path / "room.ply", CLOUD.gaussians)
     out = tmp_path / "small.onnx"
     words = [str(tmp_path / "room.ply"), f"weights={exported}", f"out={out}", "sizes=[1]", "precision=int8_dynamic"]

@@ -49,18 +49,14 @@ def test_a_gpu_computes_in_float32_without_tensorfloat_and_the_loader_of_its_lib
     assert capfd.readouterr().out == ""
 
 
-def test_a_gpu_whose_libraries_do_not_load_is_refused_by_name_and_warned_of_otherwise(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_gpu_whose_libraries_do_not_load_is_refused_by_name_and_warned_of_otherwise(monkeypatch):
     with pytest.raises(InputError, match="device=cuda: .* could not load CUDA or cuDNN"):
         opened(monkeypatch, "cuda", loads=False)
     with pytest.warns(SceneWarning, match="device=auto: .* computing on the CPU"):
         opened(monkeypatch, "auto", loads=False)
 
 
-def test_an_exporter_that_is_too_old_is_named_and_a_fault_of_a_newer_one_is_not_hidden(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_exporter_that_is_too_old_is_named_and_a_fault_of_a_newer_one_is_not_hidden(monkeypatch):
     def fails(*_: Any, **__: Any) -> None:
         raise AssertionError("should have been constant, but got u2 - 1")
 

@@ -92,9 +92,7 @@ class FeaturesOf:
 
 
 @pytest.mark.parametrize("wrong", ["first", "second"])
-def test_a_cheaper_precision_is_refused_if_any_space_is_too_far_from_float32(
-    wrong: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cheaper_precision_is_refused_if_any_space_is_too_far_from_float32(wrong, monkeypatch):
     monkeypatch.setattr(module, "OnnxNetwork", lambda model, device: model)
     monkeypatch.setattr(module, "Encoder", FeaturesOf)
     cloud = Cloud("cloud", random_cloud(50, 0.05, seed=1))

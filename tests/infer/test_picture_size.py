@@ -67,9 +67,7 @@ def test_pictures_are_as_large_as_fit_and_files_keep_the_limit(viewed: tuple[Sce
     assert LEAST <= sides[0] < sides[2]
 
 
-def test_a_side_that_took_more_than_was_predicted_is_lowered(
-    viewed: tuple[Scene, ViewSet], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_side_that_took_more_than_was_predicted_is_lowered(viewed, monkeypatch):
     scene, views = viewed
     budget = ViewsBudget(megabytes=0.03)
     expected, *_ = pictures_within(scene, views, budget)

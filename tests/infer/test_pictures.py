@@ -97,9 +97,7 @@ def test_a_box_around_the_camera_is_cut_at_the_near_plane() -> None:
     st.integers(1, 80),
 )
 @settings(deadline=None, max_examples=25)
-def test_any_box_and_any_word_can_be_drawn_on_any_picture(
-    center: tuple[float, ...], size: tuple[float, ...], query: str, width: int, height: int
-) -> None:
+def test_any_box_and_any_word_can_be_drawn_on_any_picture(center, size, query, width, height):
     drawn = draw_boxes(np.zeros((height, width, 3), np.uint8), [make_box(center, size, query)], POSE, K)
     factor = legible_factor(width)
     assert drawn.shape == (height * factor, width * factor, 3)

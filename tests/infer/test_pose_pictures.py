@@ -82,9 +82,7 @@ def test_the_ring_lies_around_the_pixel_of_the_enlarged_view(width: int, height:
 
 
 @pytest.mark.parametrize(("width", "height", "stride"), [(640, 90, 1), (646, 93, 4), (650, 90, 3)])
-def test_the_relevancy_of_a_ray_is_shown_over_the_block_of_pixels_around_it(
-    width: int, height: int, stride: int
-) -> None:
+def test_the_relevancy_of_a_ray_is_shown_over_the_block_of_pixels_around_it(width, height, stride):
     seen = seen_from(width, height, stride)
     lattice = seen.b.lattice
     point = point_at(300.5, 50.5)

@@ -2,7 +2,6 @@
 
 import base64
 import io
-from typing import Any
 
 import numpy as np
 import pytest
@@ -70,9 +69,7 @@ def test_prompts_say_what_the_pictures_are() -> None:
         ("ground", "x", ["a"], False, "needs marks"),
     ],
 )
-def test_prompts_without_what_they_need_are_refused(
-    task: Any, question: str, names: list[str], marked: bool, problem: str
-) -> None:
+def test_prompts_without_what_they_need_are_refused(task, question, names, marked, problem):
     with pytest.raises(InputError, match=problem):
         prompt_text(task, question, names, marks=(1,) if marked else (), kinds=RENDERS)
 

@@ -135,9 +135,7 @@ def test_boxes_of_another_file_stand_in_for_those_of_the_set(tmp_path: Path) -> 
         ([*SCANQA, SCANQA[0]], {}, "one question_id"),
     ],
 )
-def test_what_is_no_question_set_is_an_error(
-    tmp_path: Path, content: Any, settings: dict[str, Any], problem: str
-) -> None:
+def test_what_is_no_question_set_is_an_error(tmp_path, content, settings, problem):
     with pytest.raises(InputError, match=problem):
         read(tmp_path, content, **settings)
 

@@ -178,9 +178,7 @@ def test_the_cosine_of_a_feature_fades_as_its_distance_from_the_mean_falls_below
 
 
 @pytest.mark.parametrize("bins", [8, 64, 256])
-def test_otsu_is_the_split_of_a_histogram_with_the_most_variance_between_its_sides(
-    rng: np.random.Generator, bins: int
-) -> None:
+def test_otsu_is_the_split_of_a_histogram_with_the_most_variance_between_its_sides(rng, bins):
     """By definition, split by split; of the splits in an empty gap the middle one."""
     values = np.r_[rng.normal(0.2, 0.05, 4000), rng.normal(0.25, 0.02, 2000), rng.normal(0.9, 0.02, 200)]
     upper = np.sort(values.astype(np.float32))[len(values) // 2 :].astype(np.float64)

@@ -28,7 +28,6 @@ def written(tmp_path: Path) -> Path:
 
 def test_labels_read_back_with_names_counts_and_boxes(written: Path) -> None:
     made = read_labels(written)
-    assert SCENE.gaussians is not None
     assert (made.labels == LABELS).all()
     assert np.allclose(made.gaussians.means, SCENE.gaussians.means, atol=1e-6)
     assert np.allclose(made.gaussians.scales, SCENE.gaussians.scales, rtol=1e-5)
@@ -58,7 +57,6 @@ def test_the_labeled_splat_is_a_splat_for_every_other_reader(written: Path) -> N
 
 def test_boxes_hold_their_gaussians_stand_upright_and_have_the_colors_of_boxes(tmp_path: Path) -> None:
     """The scene is tilted, so that none of the axes of the world is upward."""
-    assert SCENE.gaussians is not None
     turn = Rotation.from_euler("zyx", [30, 25, 10], degrees=True)
     turned = replace(SCENE.gaussians, means=turn.apply(SCENE.gaussians.means).astype(np.float32))
     up = turn.apply([0.0, 0.0, 1.0])

@@ -60,9 +60,7 @@ NOTHING = (0.0, 0.0)
         (0.4, (9.0, 1.0), (14.0, 12.0), 0),  # mostly seen elsewhere
     ],
 )
-def test_what_is_partly_object_is_taken_where_pixels_show_it_or_would_show_its_ghost(
-    share: float, present: tuple[float, float], removed: tuple[float, float], expected: int
-) -> None:
+def test_what_is_partly_object_is_taken_where_pixels_show_it_or_would_show_its_ghost(share, present, removed, expected):
     assert label_of(0, share, seen=True, present=present, removed=removed) == expected
 
 
@@ -70,9 +68,7 @@ def test_what_is_partly_object_is_taken_where_pixels_show_it_or_would_show_its_g
     ("present", "expected"),
     [((9.5, 0.5), 0), ((8.0, 2.0), 1), (NOTHING, 1)],
 )
-def test_what_was_taken_is_lost_only_if_its_pixels_are_of_something_else(
-    present: tuple[float, float], expected: int
-) -> None:
+def test_what_was_taken_is_lost_only_if_its_pixels_are_of_something_else(present, expected):
     assert label_of(1, 1.0, seen=True, present=present, removed=NOTHING) == expected
 
 
@@ -88,9 +84,7 @@ def test_what_was_taken_is_lost_only_if_its_pixels_are_of_something_else(
         (1, (4.0, 6.0), NOTHING, 1),
     ],
 )
-def test_without_a_feature_more_than_half_of_the_weight_decides(
-    label: int, present: tuple[float, float], removed: tuple[float, float], expected: int
-) -> None:
+def test_without_a_feature_more_than_half_of_the_weight_decides(label, present, removed, expected):
     assert label_of(label, NO_SHARE, seen=False, present=present, removed=removed) == expected
 
 

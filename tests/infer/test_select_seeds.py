@@ -112,9 +112,7 @@ def two_mugs() -> Scene:
 
 
 @pytest.mark.parametrize(("probable", "kinds"), [(0.0, {0, 1}), (1.0, {0})])
-def test_of_two_mugs_the_more_probable_one_or_both_are_taken(
-    monkeypatch: pytest.MonkeyPatch, probable: float, kinds: set[int]
-) -> None:
+def test_of_two_mugs_the_more_probable_one_or_both_are_taken(monkeypatch, probable, kinds):
     monkeypatch.setattr(module, "PROBABLE", probable)
     selection, localization = select(two_mugs(), ("mug",), words())
     likely = [each.probability for each in localization.boxes]
@@ -267,9 +265,7 @@ def test_holes_have_the_numbers_of_their_views_and_views_without_the_object_have
 
 
 @pytest.mark.parametrize(("opacities", "opens"), [((0.45, 0.2), True), ((0.2, 0.45), False), ((0.3, 0.1), None)])
-def test_a_pixel_is_of_what_more_than_half_of_its_opacity_is_of(
-    opacities: tuple[float, float], opens: bool | None
-) -> None:
+def test_a_pixel_is_of_what_more_than_half_of_its_opacity_is_of(opacities, opens):
     """A wide half-transparent Gaussian that is removed before another one that is not."""
     gaussians = splat_of(np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.0]]), np.float32(opacities))
     gaussians = replace(gaussians, scales=np.full((2, 3), (2.0, 2.0, 0.01), np.float32))

@@ -107,9 +107,7 @@ def test_where_no_server_is_the_error_says_so() -> None:
         (stream(chunk("length", content=None)), "holds no text .*raise vlm.max_tokens", False),
     ],
 )
-def test_each_fault_is_an_error_in_one_line_of_the_server_or_of_the_question(
-    behave: Behave, problem: str, of_server: bool
-) -> None:
+def test_each_fault_is_an_error_in_one_line_of_the_server_or_of_the_question(behave, problem, of_server):
     with serving(behave) as server, pytest.raises(InputError, match=problem) as caught:
         ask(server.url, timeout=0.5)
     assert isinstance(caught.value, ServerError) == of_server

@@ -99,9 +99,7 @@ def test_what_a_view_is_worth_grows_with_what_it_shows(monkeypatch: pytest.Monke
     assert value(blur=2 * CONSTANTS.half_blur) == pytest.approx(value() / 5)
 
 
-def test_a_set_is_worth_its_views_and_what_they_cover_of_targets_context_and_directions(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_set_is_worth_its_views_and_what_they_cover_of_targets_context_and_directions(rng, monkeypatch):
     """Written out for two targets, one of them without surroundings."""
     constants = replace(CONSTANTS, cover_weight=1.0, context_weight=0.5, spread_weight=0.25)
     monkeypatch.setattr(choose, "CONSTANTS", constants)
@@ -136,9 +134,7 @@ def test_a_set_is_worth_its_views_and_what_they_cover_of_targets_context_and_dir
 
 
 @pytest.mark.parametrize("best", [1.0, 0.01])
-def test_a_view_adds_something_from_a_small_share_of_the_first_one_on_or_of_the_best_there_can_be(
-    best: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_view_adds_something_from_a_small_share_of_the_first_one_on_or_of_the_best_there_can_be(best, monkeypatch):
     none = {"cover_weight": 0.0, "context_weight": 0.0, "spread_weight": 0.0}
     monkeypatch.setattr(choose, "CONSTANTS", replace(CONSTANTS, **none))
     scene, target = cube_in_room()

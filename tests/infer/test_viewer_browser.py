@@ -102,9 +102,6 @@ def numbers_of(text: str) -> list[int]:
 def seen_mug(scene: Scene) -> tuple[int, list[float]]:
     """The view that shows most of the mug, and a point of the mug in it."""
     views = scene.views
-    assert views is not None
-    assert views.instances is not None
-    assert views.depths is not None
     number = next(each.id for each in scene.objects if each.name == "mug")
     view = int(np.argmax([(views.instances[view] == number).sum() for view in range(len(views))]))
     rows, columns = np.nonzero(views.instances[view] == number)
@@ -187,9 +184,7 @@ def test_a_served_page_finds_what_is_typed(browser: Any, bundle: Bundle, search:
         thread.join()
 
 
-def test_a_page_of_one_file_does_the_same_without_a_network(
-    browser: Any, bundle: Bundle, search: SceneSearch, scene: Scene, tmp_path: Path
-) -> None:
+def test_a_page_of_one_file_does_the_same_without_a_network(browser, bundle, search, scene, tmp_path):
     container = file_container(search, scene.objects, OPTIONS)
     settings = {"kind": "file", "scenes": 1, "notes": []}
     (tmp_path / "page.html").write_bytes(file_page(bundle, "room", settings, [container]))
@@ -212,9 +207,7 @@ def test_a_page_of_one_file_does_the_same_without_a_network(
     page.context.close()
 
 
-def test_two_folders_of_a_scene_stand_side_by_side_and_names_are_text(
-    browser: Any, bundle: Bundle, tmp_path: Path
-) -> None:
+def test_two_folders_of_a_scene_stand_side_by_side_and_names_are_text(browser, bundle, tmp_path):
     save_viewed_room(tmp_path, rename={"mug": HOSTILE}, name="harm <script> 'x'")
     search = search_of(tmp_path / "features")
     search.shown = replace(search.shown, title=HOSTILE)

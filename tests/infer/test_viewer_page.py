@@ -83,7 +83,6 @@ def small_search(
     vectors: np.ndarray, weights: np.ndarray, config: LocalizeConfig = LocalizeConfig(), **changes: object
 ) -> SceneSearch:
     """A search over Gaussians with the given features; the words are the axes, and their mean is removed."""
-    assert ROOM.gaussians is not None
     scene = replace(
         ROOM,
         gaussians=ROOM.gaussians.select(np.arange(len(vectors))),
@@ -147,9 +146,7 @@ def test_header_and_arrays_begin_at_multiples_of_eight_bytes(length: int) -> Non
             read_container(data[: 12 + header + listed["second"]["offset"] + 4 * length - cut])
 
 
-def test_relevancy_from_the_arrays_of_a_page_is_that_of_the_features_within_the_budget(
-    search: SceneSearch, written: Container
-) -> None:
+def test_relevancy_from_the_arrays_of_a_page_is_that_of_the_features_within_the_budget(search, written):
     features = search.shown.features
     table = search.words
     budget = written.meta["featureError"]
@@ -175,9 +172,7 @@ def test_what_a_server_answers_is_the_relevancy_in_steps(search: SceneSearch) ->
 
 
 @pytest.mark.filterwarnings("ignore:.*words have no box")
-def test_boxes_of_a_word_are_those_of_localize_at_any_threshold_and_a_file_has_those_of_all_words(
-    search: SceneSearch, written: Container
-) -> None:
+def test_boxes_of_a_word_are_those_of_localize_at_any_threshold_and_a_file_has_those_of_all_words(search, written):
     for name, answer in zip(search.words.names, written.meta["answers"], strict=True):
         localization = localize(search.shown.scene, [name], search.words, search.config)
         sent = search.boxes(name)
@@ -224,7 +219,6 @@ def test_equal_features_have_equal_colors_others_differ_and_unseen_ones_are_grey
 
 
 def test_the_splat_of_a_page_has_the_shapes_and_colors_of_its_gaussians(tmp_path: Path) -> None:
-    assert ROOM.gaussians is not None
     (tmp_path / "a.spz").write_bytes(spz_bytes(ROOM.gaussians))
     read = load_splat(tmp_path / "a.spz")
     # Logarithms of scales have steps of 1/16.
@@ -237,9 +231,7 @@ def test_the_splat_of_a_page_has_the_shapes_and_colors_of_its_gaussians(tmp_path
     ("weights", "codes", "ends"),
     [([0, 0], [0, 0], (1, 1)), ([3, 3], [1, 1], (3, 3)), ([0, 1, 10, 100], [0, 1, 128, 255], (1, 100))],
 )
-def test_weights_are_coded_by_their_logarithm_and_zero_means_never(
-    weights: list[float], codes: list[int], ends: tuple[float, float]
-) -> None:
+def test_weights_are_coded_by_their_logarithm_and_zero_means_never(weights, codes, ends):
     made = weight_bytes(np.array(weights, np.float32))
     np.testing.assert_array_equal(made[0], codes)
     assert made[1:] == ends
@@ -277,7 +269,6 @@ def test_a_page_knows_the_units_the_weights_and_the_cameras_of_its_scene(search:
     assert made.meta["photographs"] is False
     assert made.meta["weights"] == list(weight_bytes(search.shown.features.weights)[1:])
     assert made.meta["floor"] == feature_axes(search.shown.features).floor > 0
-    assert ROOM.views is not None
     cameras = ROOM.views.cameras
     assert made.arrays["sizes"].tolist() == np.stack([cameras.widths, cameras.heights], axis=1).tolist()
     np.testing.assert_array_equal(made.arrays["camFromWorld"], cameras.cam_from_world)
@@ -286,7 +277,6 @@ def test_a_page_knows_the_units_the_weights_and_the_cameras_of_its_scene(search:
 def test_options_of_a_file_bound_harmonics_features_and_photographs(search: SceneSearch, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     scene = search.shown.scene
-    assert scene.gaussians is not None
     sh = np.concatenate([scene.gaussians.sh, 0.1 * rng.normal(size=(len(scene.gaussians), 8, 3))], axis=1)
     rich = replace_shown(
         search, replace(scene, gaussians=replace(scene.gaussians, sh=sh.astype(np.float32)), views=ROOM.views)
@@ -302,7 +292,6 @@ def test_options_of_a_file_bound_harmonics_features_and_photographs(search: Scen
     sizes = made.meta["photographSizes"]
     assert len(sizes) == 3
     assert sum(sizes) == len(made.arrays["photographs"])
-    assert ROOM.views is not None
     assert ROOM.views.images is not None
     start = 0
     for view, size in zip(made.meta["photographViews"], sizes, strict=True):
@@ -411,7 +400,6 @@ def test_a_page_may_run_its_own_script_alone_and_connect_to_its_server_alone(ser
     page = made.decode()
     if not served:
         match = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', page)
-        assert match is not None
         policy = unescape(match[1])
     script = page[page.rindex("<script>") + len("<script>") : page.rindex("</script>")]
     style = page[page.index("<style>") + len("<style>") : page.index("</style>")]
@@ -433,7 +421,6 @@ def test_a_script_cannot_end_its_element() -> None:
 def test_a_page_of_the_same_scene_is_the_same_whenever_it_is_written() -> None:
     page = file_page(STUB, "a", SETTINGS, [Container(meta={}, arrays={})]).decode()
     match = re.search(r'id="scene-0">([^<]+)<', page)
-    assert match is not None
     # The time in the header of gzip.
     assert base64.b64decode(match[1])[4:8] == bytes(4)
 

@@ -119,7 +119,6 @@ def test_each_scene_is_answered_under_its_own_number(server: ViewServer, searche
 
 def test_photographs_come_whole_and_a_scene_without_any_says_so(server: ViewServer) -> None:
     photographs = room_scene().views
-    assert photographs is not None
     assert photographs.images is not None
     for view in (0, 4):
         with Image.open(io.BytesIO(call(server, "GET", at(server, f"photograph/0/{view}"))[1])) as picture:
@@ -205,9 +204,7 @@ def test_a_length_is_a_number_and_not_too_large(server: ViewServer, lines: tuple
     assert sent(server, head(server, "POST", "ask", *lines)).split()[1] == status
 
 
-def test_a_body_that_does_not_come_is_waited_for_and_then_refused(
-    server: ViewServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_body_that_does_not_come_is_waited_for_and_then_refused(server, monkeypatch):
     assert 0 < viewer_server.TIMEOUT <= 60
     monkeypatch.setattr(viewer_server._Handler, "timeout", 0.2)
     lines = ("Content-Type: application/json", "Content-Length: 10")
@@ -347,9 +344,7 @@ def test_questions_from_many_threads_have_their_own_answers(server: ViewServer, 
         np.testing.assert_array_equal(answers[number], searches[0].ask(word).relevancy)
 
 
-def test_a_client_that_resets_its_connection_prints_nothing(
-    server: ViewServer, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_client_that_resets_its_connection_prints_nothing(server, capfd):
     for text in ("", "GET / HT", head(server, "GET", "scene/0")):
         stream = connected(server)
         stream.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

@@ -87,9 +87,7 @@ def test_views_are_chosen_from_the_side_that_a_wall_leaves_open() -> None:
     assert all(each.target_scores[0].alpha > 0.9 for each in chosen.chosen)
 
 
-def test_the_same_views_are_chosen_however_the_gaussians_are_ordered_and_wherever_the_room_is(
-    rng: np.random.Generator,
-) -> None:
+def test_the_same_views_are_chosen_however_the_gaussians_are_ordered_and_wherever_the_room_is(rng):
     scene, target = cube_in_room()
     here = choose_views(scene, [target], replace(SHELLS, source="both"))
     order = rng.permutation(len(scene.gaussians))

@@ -83,9 +83,7 @@ def test_frames_that_are_all_judged_are_the_candidates_that_are_reported() -> No
     assert choose_views_within(few, [target], config, ViewsBudget(seconds=1e4)).chosen == {"candidates": 3}
 
 
-def test_the_command_records_the_limit_and_warns_where_it_is_broken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_records_the_limit_and_warns_where_it_is_broken(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "CANDIDATES", (4, 6))
     save_room(tmp_path / "features", step=0.12)
     size = ("choose.count=2", "choose.width=120", "choose.height=90", "quiet=true")

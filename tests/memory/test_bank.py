@@ -192,9 +192,7 @@ def mixed_maps(rounding: float = 0.0) -> tuple[list[FeatureMap], np.ndarray]:
 
 @pytest.mark.parametrize("rounding", [0.0, 1e-5])
 @pytest.mark.parametrize("config", [BankConfig(), BankConfig(threshold=0.95), BankConfig(components=40)])
-def test_cells_at_the_mean_have_one_component_and_take_no_part_in_the_cover(
-    rounding: float, config: BankConfig
-) -> None:
+def test_cells_at_the_mean_have_one_component_and_take_no_part_in_the_cover(rounding, config):
     maps, at_mean = mixed_maps(rounding)
     rows = np.concatenate([each.features.reshape(-1, 16) for each in maps if each.features is not None])
     bank = build_bank(stream(maps), SPACE, MEAN, config)

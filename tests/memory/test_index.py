@@ -110,9 +110,7 @@ def test_the_threshold_that_is_stated_is_the_largest_one_whose_table_has_so_few_
         assert (len(cover) <= 60) == few
 
 
-def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refused(monkeypatch):
     features = make_features()
     for rows in (30, 300):
         made = index_features(features, IndexConfig(threshold=0.0, rows=rows))
@@ -155,9 +153,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "features"
 
 
-def test_pack_writes_an_index_that_localize_and_pack_read(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pack_writes_an_index_that_localize_and_pack_read(folder, tmp_path, capsys):
     out = tmp_path / "out"
     assert cli.main(["pack", str(folder), "form=index", "index.threshold=0.8", f"out={out}"]) == 0
     results = json.loads((out / "summary.json").read_text())["results"]
@@ -176,9 +172,7 @@ def test_pack_writes_an_index_that_localize_and_pack_read(
     np.testing.assert_array_equal(stored, load_features(out).features["s"].stored())
 
 
-def test_settings_of_an_index_and_another_splat_are_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_of_an_index_and_another_splat_are_refused(folder, tmp_path, capsys):
     out = tmp_path / "out"
     for words, message in (
         (["index.threshold=1.2"], "index.threshold: expected 0 to 1, got 1.2"),

@@ -1,7 +1,5 @@
 """Reductions of raw features: the published algorithm beside its transcription, and what holds of a cover."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -48,9 +46,7 @@ def transcription(
 
 @pytest.mark.parametrize("drop_last", [False, True])
 @pytest.mark.parametrize("threshold", [0.5, 0.9, 0.98])
-def test_the_published_algorithm_gives_what_its_transcription_gives(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, threshold: float, drop_last: bool
-) -> None:
+def test_the_published_algorithm_gives_what_its_transcription_gives(rng, monkeypatch, threshold, drop_last):
     # Few witnesses and small products, so that rows are settled in all three ways.
     monkeypatch.setattr(reduction, "WITNESSES", 20)
     monkeypatch.setattr(reduction, "BLOCK", 100)
@@ -64,9 +60,7 @@ def test_the_published_algorithm_gives_what_its_transcription_gives(
 
 
 @pytest.mark.parametrize("threshold", [0.3, 0.9, 0.99])
-def test_every_feature_is_within_the_threshold_of_a_component_of_a_cover(
-    rng: np.random.Generator, threshold: float
-) -> None:
+def test_every_feature_is_within_the_threshold_of_a_component_of_a_cover(rng, threshold):
     features = redundant_rows(rng, 3000)
     rows = cover_of(features, threshold)
     unit = features.astype(np.float64)
@@ -79,9 +73,7 @@ def test_every_feature_is_within_the_threshold_of_a_component_of_a_cover(
     assert among.max() < threshold + 2 * reduction.ROUNDING
 
 
-def test_a_feature_whose_cosine_only_rounds_to_the_threshold_has_a_component_of_its_own(
-    rng: np.random.Generator,
-) -> None:
+def test_a_feature_whose_cosine_only_rounds_to_the_threshold_has_a_component_of_its_own(rng):
     """So that a cover holds in exact arithmetic."""
     leader = rng.normal(size=96)
     leader /= np.linalg.norm(leader)
@@ -108,9 +100,7 @@ def test_a_cover_is_the_same_however_features_are_divided(rng: np.random.Generat
 
 
 @pytest.mark.parametrize("reduce", [published, cover_of])
-def test_equal_directions_are_one_component_and_others_each_at_a_threshold_of_one(
-    rng: np.random.Generator, reduce: Callable[[np.ndarray, float], np.ndarray]
-) -> None:
+def test_equal_directions_are_one_component_and_others_each_at_a_threshold_of_one(rng, reduce):
     """Though the product of a row with itself may round to less than 1."""
     direction = np.linspace(-1, 2, 384, dtype=np.float32)
     features = np.stack([direction * length for length in (1e-30, 1, 3e37, 7, 1e-3)]).astype(np.float32)

@@ -45,7 +45,6 @@ def test_the_layers_after_the_transformer_have_gradients_of_float32_under_autoca
         loss = network(attributes, opacities, network.join([cloud])).square().mean()
     loss.backward()
     for parameter in network.head.parameters():
-        assert parameter.grad is not None
         assert (parameter.grad != parameter.grad.bfloat16().float()).float().mean() > 0.9
 
 

@@ -74,9 +74,7 @@ def test_on_a_full_grid_the_convolution_is_a_dense_one_with_zeros_around(size: i
 @pytest.mark.parametrize("size", [3, 5])
 @pytest.mark.parametrize("count", [1, 5, 300])
 @pytest.mark.parametrize("block_rows", [64, 8192])
-def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(
-    size: int, count: int, block_rows: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(size, count, block_rows, monkeypatch):
     monkeypatch.setattr(neighbors, "CPU_BLOCK_ROWS", block_rows)
     table = neighbor_table(distinct_cells(count, 8), size)  # type: ignore[arg-type]
     layer = NeighborConv(3, 5, size).double()  # type: ignore[arg-type]
@@ -91,9 +89,7 @@ def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(
 
 
 @pytest.mark.parametrize("line", [False, True])
-def test_cells_that_no_token_of_a_block_needs_are_left_out_and_nothing_but_rounding_changes(
-    line: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cells_that_no_token_of_a_block_needs_are_left_out_and_nothing_but_rounding_changes(line, monkeypatch):
     """Isolated tokens, or a line of them, after a block of neighbors."""
     monkeypatch.setattr(neighbors, "CPU_BLOCK_ROWS", 64)
     dense = torch.cartesian_prod(*[torch.arange(4)] * 3)

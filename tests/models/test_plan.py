@@ -70,7 +70,6 @@ def test_tokens_are_the_occupied_cells() -> None:
 def test_patches_of_a_cloud_differ_by_one_token_at_most() -> None:
     plan = make_plan(cloud(1000), VOXEL, levels=1, patch=64)
     level = plan.levels[0]
-    assert level.attn_mask is not None
     sizes = level.attn_mask.reshape(-1, level.patch_width).sum(dim=1)
     assert sizes.max() - sizes.min() <= 1
     assert level.patch_width <= 64
@@ -95,9 +94,7 @@ def patch_of(level: Level, order: int, tokens: int) -> torch.Tensor:
 
 @given(st.integers(30, 400), st.integers(1, 3), st.integers(2, 40), st.integers(0, 5))
 @settings(max_examples=40)
-def test_tokens_of_a_part_share_a_patch_exactly_where_they_do_in_the_whole(
-    count: int, levels: int, patch: int, seed: int
-) -> None:
+def test_tokens_of_a_part_share_a_patch_exactly_where_they_do_in_the_whole(count, levels, patch, seed):
     points = cloud(count, seed)
     part = torch.nonzero(points[:, 0] > 0.7).flatten()
     if not len(part):

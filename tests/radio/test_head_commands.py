@@ -50,9 +50,7 @@ def test_fusing_leaves_measured_heads_and_says_what_the_basis_costs_each(fused: 
         assert head.cells == 3 * 4 * 6
 
 
-def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(
-    world: World, fused: Path, tmp_path: Path
-) -> None:
+def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(world, fused, tmp_path):
     run(
         "localize",
         str(fused),
@@ -85,9 +83,7 @@ def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(
     np.testing.assert_allclose(made.relevancy[0][features.seen], cosines[features.seen], atol=1e-4)
 
 
-def test_a_text_table_of_the_width_of_a_head_is_asked(
-    fused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_text_table_of_the_width_of_a_head_is_asked(fused, tmp_path, capsys):
     for channels in (16, 12):
         vectors = np.random.default_rng(0).normal(size=(3, channels)).astype(np.float32)
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -108,9 +104,7 @@ def test_training_stores_the_heads_of_its_loss_and_those_asked_for_besides(train
     assert (trained / "log.csv").read_text().splitlines()[0].count("render") == 1
 
 
-def test_encoded_features_carry_the_heads_of_the_weights(
-    world: World, trained: Path, encoded: Path, tmp_path: Path
-) -> None:
+def test_encoded_features_carry_the_heads_of_the_weights(world, trained, encoded, tmp_path):
     assert (encoded / "heads.safetensors").read_bytes() == (trained / "heads.safetensors").read_bytes()
     run(
         "localize",
@@ -126,9 +120,7 @@ def test_encoded_features_carry_the_heads_of_the_weights(
 
 
 @pytest.mark.parametrize(("source", "protocol"), [("weights", "localization"), ("fused", "naming")])
-def test_outputs_of_a_head_are_evaluated(
-    world: World, trained: Path, tmp_path: Path, source: str, protocol: str
-) -> None:
+def test_outputs_of_a_head_are_evaluated(world, trained, tmp_path, source, protocol):
     of = (f"weights={trained}",) if source == "weights" else world.teacher
     limits = ("protocol.min_views=1", "protocol.min_pixels=5") if protocol == "localization" else ()
     run(
@@ -146,9 +138,7 @@ def test_outputs_of_a_head_are_evaluated(
     assert results["objects" if protocol == "localization" else "names"]
 
 
-def test_packed_outputs_of_a_head_are_asked_with_the_words_beside_them(
-    world: World, encoded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_packed_outputs_of_a_head_are_asked_with_the_words_beside_them(world, encoded, tmp_path, capsys):
     run("pack", str(encoded), "head=siglip", *world.text, f"out={tmp_path / 'p'}")
     assert features_of(tmp_path / "p").space.layer == "siglip.summary"
     assert not (tmp_path / "p" / "heads.safetensors").exists()
@@ -183,9 +173,7 @@ def test_tokens_are_outputs_of_the_head_for_rendered_features(world: World, enco
     assert (through.shape, space.split(" · ")[0]) == ((2, 20, 16), "radio-radio/siglip.features")
 
 
-def test_a_training_goes_on_only_with_the_heads_that_it_began_with(
-    world: World, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_training_goes_on_only_with_the_heads_that_it_began_with(world, trained, tmp_path, monkeypatch, capsys):
     def interrupted(*arguments: Any) -> None:
         raise KeyboardInterrupt
 

@@ -2,13 +2,12 @@
 
 import shutil
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from command_runs import refusal
-from radio_world import QUICK, SEEDS, World, run
+from radio_world import QUICK, SEEDS, run
 from radios import small_joint_model, small_radio
 
 from gsencoder.app.heads import words_of_head
@@ -19,9 +18,7 @@ from gsencoder.text.models import TransformersTextConfig
 pytestmark = pytest.mark.slow
 
 
-def test_heads_of_another_backbone_are_refused(
-    world: World, fused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_heads_of_another_backbone_are_refused(world, fused, tmp_path, capsys):
     copy = tmp_path / "fused"
     shutil.copytree(fused, copy)
     other = small_radio(tmp_path / "radio", seed=5)
@@ -56,16 +53,12 @@ def test_heads_of_another_backbone_are_refused(
         (("query=mug",), "there is no words.safetensors beside these features"),
     ],
 )
-def test_a_head_that_words_cannot_be_compared_with_is_refused(
-    world: World, fused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: Sequence[str], message: str
-) -> None:
+def test_a_head_that_words_cannot_be_compared_with_is_refused(world, fused, tmp_path, capsys, words, message):
     text = world.text if any(word.startswith("head=") for word in words) else ()
     assert message in refusal(capsys, "localize", str(fused), *words, *text, f"out={tmp_path / 'x'}")
 
 
-def test_words_of_another_model_are_refused_and_both_are_named(
-    world: World, fused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_words_of_another_model_are_refused_and_both_are_named(world, fused, tmp_path, capsys):
     arguments = ("localize", str(fused), "head=siglip", "query=mug", f"out={tmp_path / 'x'}")
     assert (
         "no words lead into its space; give text=transformers text.model=FOLDER, the text side of ViT-SO400M-14-Sig"
@@ -82,9 +75,7 @@ def test_words_of_another_model_are_refused_and_both_are_named(
     assert "leads to a siglip model, and the words of 'clip' are those of a clip model" in line
 
 
-def test_features_without_heads_and_heads_without_features_are_refused(
-    world: World, fused: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_features_without_heads_and_heads_without_features_are_refused(world, fused, trained, tmp_path, capsys):
     copy = tmp_path / "fused"
     shutil.copytree(fused, copy)
     (copy / "heads.safetensors").unlink()
@@ -109,9 +100,7 @@ def test_features_without_heads_and_heads_without_features_are_refused(
         (("heads=[siglip,siglip.summary]",), "heads: siglip, siglip.summary names a head twice"),
     ],
 )
-def test_heads_that_a_training_cannot_use_are_refused(
-    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: Sequence[str], message: str
-) -> None:
+def test_heads_that_a_training_cannot_use_are_refused(world, tmp_path, capsys, words, message):
     teacher = () if any(word.startswith("teacher=") for word in words) else world.teacher
     out = f"out={tmp_path / 'run'}"
     assert message in refusal(capsys, "train", world.room(0), *teacher, *words, *SEEDS, *QUICK[1:], out)

@@ -107,9 +107,7 @@ def test_what_all_maps_have_in_common_is_not_applied() -> None:
 
 
 @pytest.mark.parametrize(("gains", "stays"), [(np.ones(6), False), (GAINS, True)])
-def test_maps_are_given_up_after_three_looks_at_each_photograph_if_they_do_not_differ(
-    gains: np.ndarray, stays: bool
-) -> None:
+def test_maps_are_given_up_after_three_looks_at_each_photograph_if_they_do_not_differ(gains, stays):
     rounds = len(TRAINING) * ROUNDS
     early, late = (fitted(exposed_views(gains), replace(CONFIG, steps=steps)) for steps in (rounds - 1, rounds))
     assert early.exposures is not None

@@ -1,6 +1,5 @@
 """Reconstructions within a budget: its limits, and what became of them."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,9 +37,7 @@ def short(**limits: float) -> ReconstructConfig:
 
 
 @pytest.mark.parametrize("share", [0.7, 0.1])
-def test_the_file_is_no_larger_than_limited_and_as_large_as_predicted(
-    scene: Scene, share: float, tmp_path: Path
-) -> None:
+def test_the_file_is_no_larger_than_limited_and_as_large_as_predicted(scene, share, tmp_path):
     limit = share * len(seed(scene, SEEDS)) * 164 / 1e6
     result = reconstruct(scene, short(megabytes=limit))
     save_splat(tmp_path / "part.ply", result.gaussians)
@@ -86,9 +83,7 @@ def test_what_reading_took_counts_to_limited_seconds(scene: Scene, monkeypatch: 
         (lambda: limited(seconds=float("nan")), "seconds: expected a number above 0, got nan"),
     ],
 )
-def test_limits_that_mean_nothing_or_exclude_each_other_are_refused(
-    config: Callable[[], ReconstructConfig], problem: str
-) -> None:
+def test_limits_that_mean_nothing_or_exclude_each_other_are_refused(config, problem):
     with pytest.raises(InputError, match=problem):
         config()
 
@@ -112,9 +107,7 @@ def test_a_run_of_another_limit_and_one_of_impossible_colors_do_not_go_on(scene:
         reconstruct(scene, short(), work=tmp_path)
 
 
-def test_limits_and_what_became_of_them_are_printed_and_recorded(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_limits_and_what_became_of_them_are_printed_and_recorded(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(planning, "MOST_STEPS", STEPS)
     words = ["reconstruct", str(folder), f"out={tmp_path / 'out'}", "seeds.voxel=0.15", "holdout=3"]
     words += ["data.image_scale=0.5"]
@@ -156,9 +149,7 @@ class Wall:
 
 
 @pytest.mark.parametrize(("seconds", "steps", "elapsed"), [(4.0, 21, 84), (8.0, 13, 104), (2.5, 21, 52.5)])
-def test_the_planned_steps_are_done_and_end_early_where_the_clock_runs_out(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch, seconds: float, steps: int, elapsed: float
-) -> None:
+def test_the_planned_steps_are_done_and_end_early_where_the_clock_runs_out(scene, monkeypatch, seconds, steps, elapsed):
     lines: list[str] = []
     result = reconstruct(scene, limited(seconds=100.0), now=Wall(monkeypatch, seconds), report=lines.append)
     assert (result.steps, result.plan.steps, result.elapsed) == (steps, 21, elapsed)
@@ -169,9 +160,7 @@ def test_the_planned_steps_are_done_and_end_early_where_the_clock_runs_out(
         np.testing.assert_array_equal(reconstruct(scene, again).gaussians.means, result.gaussians.means)
 
 
-def test_a_run_that_was_cut_goes_on_by_the_clock_and_what_is_too_large_is_taken_out(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_run_that_was_cut_goes_on_by_the_clock_and_what_is_too_large_is_taken_out(scene, monkeypatch, tmp_path):
     clock, config = Wall(monkeypatch, 40.0), limited(seconds=100.0, megabytes=0.02)
     with cut_at(1):
         reconstruct(scene, config, now=clock, work=tmp_path)
@@ -183,9 +172,7 @@ def test_a_run_that_was_cut_goes_on_by_the_clock_and_what_is_too_large_is_taken_
 
 
 @pytest.mark.usefixtures("no_gpu")
-def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(scene, tmp_path, monkeypatch):
     """Also on a machine that would have planned other ones."""
     monkeypatch.setattr(planning, "LEAST_STEPS", 20)
     with cut_at(7):
@@ -197,9 +184,7 @@ def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
     assert "13 more of 20 steps instead of 1,500 (budget.minutes)" in lines[0]
 
 
-def test_a_limit_that_registering_alone_exceeds_is_refused_in_the_midst_of_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_limit_that_registering_alone_exceeds_is_refused_in_the_midst_of_it(tmp_path, monkeypatch, capsys):
     for name in "abc":
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg")
     monkeypatch.setattr(sfm, "_map", lambda *arguments: arguments[-2]())

@@ -341,9 +341,7 @@ def test_what_pulls_forever_moves_no_further_than_the_reach(rate: float, reach: 
 
 
 @pytest.mark.slow
-def test_an_anchor_holds_positions_and_is_pruned_with_its_gaussians_and_taken_up_with_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_anchor_holds_positions_and_is_pruned_with_its_gaussians_and_taken_up_with_them(tmp_path, monkeypatch):
     monkeypatch.setitem(RATES, "means", 0.03)
     whole, cut = held(0.3), held(0.3)
     for _ in range(16):

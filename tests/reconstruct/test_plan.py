@@ -149,9 +149,7 @@ def test_less_room_first_costs_degrees_of_color_and_then_gaussians(optimizer: Op
     assert planned(optimizer, wide, double=True).most == (contributing * 68) // 80
 
 
-def test_where_nothing_contributes_yet_all_gaussians_are_to_fit(
-    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_nothing_contributes_yet_all_gaussians_are_to_fit(optimizer, monkeypatch):
     def none_left(_: Optimizer) -> None:
         raise InputError("reconstruct: pruning would leave none")
 
@@ -198,9 +196,7 @@ def test_a_full_pruning_leaves_those_that_contribute_most_in_their_order(optimiz
 @pytest.mark.parametrize(
     ("seconds", "steps", "total"), [(100.0, 17, 83.0), (1000.0, 100, 332.0), (60.0, 6, 50.0), (45.0, 2, 38.0)]
 )
-def test_seconds_buy_steps_by_what_trial_steps_take(
-    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch, seconds: float, steps: int, total: float
-) -> None:
+def test_seconds_buy_steps_by_what_trial_steps_take(optimizer, monkeypatch, seconds, steps, total):
     """A step takes 3 s, all else 12 s, and 20 s are spent; at most 100 steps."""
     monkeypatch.setattr(planning, "MOST_STEPS", 100)
     monkeypatch.setattr(planning, "FEW_STEPS", 5)
@@ -211,9 +207,7 @@ def test_seconds_buy_steps_by_what_trial_steps_take(
     assert plan.notes == (few if steps < 5 else ())
 
 
-def test_seconds_are_kept_for_as_many_validations_as_the_steps_have_and_for_the_pictures(
-    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_seconds_are_kept_for_as_many_validations_as_the_steps_have_and_for_the_pictures(optimizer, monkeypatch):
     """Of the 1,500 steps of the settings there would be five times as many validations."""
     measured = Costs(steps={1: 3.0, 2: 3.0}, pruning=4.0, validation=6.0, picture=4.0)
     monkeypatch.setattr(planning, "measured_costs", lambda *_: measured)

@@ -43,9 +43,7 @@ def test_the_result_says_what_was_fitted_and_what_was_held_out(scene: Scene, res
 
 
 @pytest.mark.usefixtures("no_gpu")
-def test_an_interrupted_call_is_continued_from_its_folder_with_the_same_result(
-    scene: Scene, result: Reconstruction, tmp_path: Path
-) -> None:
+def test_an_interrupted_call_is_continued_from_its_folder_with_the_same_result(scene, result, tmp_path):
     with cut_at(2):
         reconstruct(scene, QUICK, work=tmp_path)
     continued = reconstruct(scene, QUICK, work=tmp_path)

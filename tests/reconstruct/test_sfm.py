@@ -102,9 +102,7 @@ def test_links_that_lead_out_of_the_folder_are_refused_before_photographs_are_pl
     assert placing.calls == [(photographs, False)]
 
 
-def test_a_run_that_was_cut_off_is_not_continued_with_other_poses(
-    photographs: Path, work: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_was_cut_off_is_not_continued_with_other_poses(photographs, work, monkeypatch):
     placing = Placing(monkeypatch)
     (work / CHECKPOINT_FILE).symlink_to("gone")
     with pytest.raises(
@@ -114,9 +112,7 @@ def test_a_run_that_was_cut_off_is_not_continued_with_other_poses(
     assert placing.calls == []
 
 
-def test_videos_and_photographs_are_found_in_folders_and_nothing_that_is_hidden(
-    photographs: Path, posed: Path, tmp_path: Path
-) -> None:
+def test_videos_and_photographs_are_found_in_folders_and_nothing_that_is_hidden(photographs, posed, tmp_path):
     for name in ("walk.mp4", ".walk.mp4", "notes.txt"):
         (tmp_path / name).write_bytes(b"")
     posed.rename(tmp_path / ".posed")

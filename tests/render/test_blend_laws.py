@@ -1,7 +1,6 @@
 """The laws that make B useful: sums, adjoints, permutations, movements, ranges of depth."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -139,9 +138,7 @@ def test_keeping_a_range_of_depths_is_keeping_the_entries_inside_it(rng: np.rand
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize(("patch", "rays"), [(None, 1), (7, 16)])
-def test_a_blend_of_a_range_of_depths_is_the_whole_one_with_the_entries_inside_it(
-    backend: Any, patch: int | None, rays: int, rng: np.random.Generator
-) -> None:
+def test_a_blend_of_a_range_of_depths_is_the_whole_one_with_the_entries_inside_it(backend, patch, rays, rng):
     config = BlendConfig(rays_per_patch=rays, backend=backend)
     gaussians, camera = random_gaussians(400), front_camera(61, 40)
     whole = blend(gaussians, camera, patch=patch, config=config)

@@ -72,9 +72,7 @@ def read(folder: Path, *names: str) -> list[Head]:
         ("v2", "v1", 2, True),
     ],
 )
-def test_a_head_computes_what_its_form_says(
-    tmp_path: Path, version: str, spatial: str | None, inner: int, pre_norm: bool
-) -> None:
+def test_a_head_computes_what_its_form_says(tmp_path, version, spatial, inner, pre_norm):
     small_radio(tmp_path, version=version, spatial_version=spatial, inner=inner, pre_norm=pre_norm)
     x = torch.randn(7, 24)
     for head in read(tmp_path, "siglip.summary", "siglip.features", "sam.summary", "sam.features"):
@@ -194,9 +192,7 @@ def sizes(**changes: Any) -> dict[str, Any]:
         ("dino_v2", {}, r"dino_v2: there is no such adapter; config\.json has sam, siglip"),
     ],
 )
-def test_a_configuration_of_no_such_head_is_refused(
-    tmp_path: Path, name: str, config: dict[str, Any], message: str
-) -> None:
+def test_a_configuration_of_no_such_head_is_refused(tmp_path, name, config, message):
     small_radio(tmp_path)
     change_config(tmp_path, **config)
     with pytest.raises(InputError, match=message) as error:

@@ -208,9 +208,7 @@ def plain_vit() -> Any:
 
 
 @pytest.mark.parametrize(("make", "joint"), [(joint_clip, True), (joint_siglip, True), (plain_vit, False)])
-def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_library(
-    tmp_path: Path, make: Any, joint: bool
-) -> None:
+def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_library(tmp_path, make, joint):
     torch.manual_seed(0)
     model, processor = make()
     model = model.eval()

@@ -200,9 +200,7 @@ def test_regions_without_a_caption_are_counted_in_a_warning(tmp_path: Path, rest
     assert (codes[labels_of(0) != 1] == (-1 if rest == "none" else 0)).all()
 
 
-def test_a_scene_lacks_what_is_named_relative_to_it_and_an_absolute_path_without_anything_is_wrong(
-    tmp_path: Path,
-) -> None:
+def test_a_scene_lacks_what_is_named_relative_to_it_and_an_absolute_path_without_anything_is_wrong(tmp_path):
     write_masks(tmp_path / "masks")
     scene = region_scene(tmp_path)
     for options, lacks in (

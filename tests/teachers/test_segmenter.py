@@ -61,15 +61,7 @@ def expected_shares(image: np.ndarray) -> np.ndarray:
         (TensorProto.UINT8, (1, 3, 8, 12), False),
     ],
 )
-def test_shares_are_the_posteriors_in_every_layout(
-    tmp_path: Path,
-    rng: np.random.Generator,
-    image: np.ndarray,
-    monkeypatch: pytest.MonkeyPatch,
-    input_type: int,
-    shape: Any,
-    last: bool,
-) -> None:
+def test_shares_are_the_posteriors_in_every_layout(tmp_path, rng, image, monkeypatch, input_type, shape, last):
     monkeypatch.setattr(segmenter, "MULTIPLE", 4)
     save_graph(tmp_path / "net.onnx", input_type=input_type, shape=shape, last=last)
     teacher = teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, size=12))
@@ -84,9 +76,7 @@ def test_a_picture_of_another_size_is_squeezed_into_a_fixed_one(tmp_path: Path, 
     np.testing.assert_allclose(made.grid_from_image, [[6 / 24, 0, 0], [0, 4 / 20, 0]])
 
 
-def test_classes_are_means_of_their_synonyms_and_nothing_is_the_mean_direction(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_classes_are_means_of_their_synonyms_and_nothing_is_the_mean_direction(tmp_path, rng):
     save_graph(tmp_path / "net.onnx")
     table = words(rng)
     teacher = teacher_of(tmp_path / "net.onnx", table)
@@ -101,9 +91,7 @@ def test_classes_are_means_of_their_synonyms_and_nothing_is_the_mean_direction(
     ]
 
 
-def test_fusing_shares_equals_fusing_the_vectors_that_they_stand_for(
-    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
-) -> None:
+def test_fusing_shares_equals_fusing_the_vectors_that_they_stand_for(tmp_path, rng, image):
     save_graph(tmp_path / "net.onnx")
     teacher = teacher_of(tmp_path / "net.onnx", words(rng))
     scene = Scene(name="s", gaussians=random_gaussians(200), views=views_of(image))
@@ -182,9 +170,7 @@ def test_words_are_those_of_a_table_or_of_the_colors_or_none(tmp_path: Path, rng
 
 
 @pytest.mark.parametrize(("fourth", "probable"), [(0.509, True), (0.52, False), (0.48, False)])
-def test_outputs_that_are_probabilities_already_are_taken_as_they_are(
-    tmp_path: Path, rng: np.random.Generator, fourth: float, probable: bool
-) -> None:
+def test_outputs_that_are_probabilities_already_are_taken_as_they_are(tmp_path, rng, fourth, probable):
     """Rounded ones may differ from a sum of 1 by a hundredth."""
     save_graph(tmp_path / "net.onnx", fourth=fourth)
     image = np.broadcast_to(np.uint8([3, 6, 9]), (8, 12, 3)).copy()
@@ -202,9 +188,7 @@ def test_pictures_are_normalized_as_those_of_imagenet_unless_stated() -> None:
 
 
 @pytest.mark.parametrize("byte", [False, True])
-def test_settings_tell_how_pictures_are_given_to_the_network(
-    tmp_path: Path, rng: np.random.Generator, byte: bool
-) -> None:
+def test_settings_tell_how_pictures_are_given_to_the_network(tmp_path, rng, byte):
     """Maps that were made otherwise are not taken up; a network of bytes is not given normalized ones."""
     save_graph(
         tmp_path / "net.onnx", input_type=TensorProto.UINT8 if byte else TensorProto.FLOAT, shape=("n", 3, "h", "w")

@@ -95,9 +95,7 @@ def semantic_shares(outputs: Any) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize("size", [(64, 48)])
-def test_a_oneformer_gives_the_semantic_map_of_its_library_and_fetches_no_list_of_classes(
-    tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]
-) -> None:
+def test_a_oneformer_gives_the_semantic_map_of_its_library_and_fetches_no_list_of_classes(tmp_path, rng, size):
     torch.manual_seed(0)
     model, processor = save_oneformer(tmp_path)
     image = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
@@ -111,9 +109,7 @@ def test_a_oneformer_gives_the_semantic_map_of_its_library_and_fetches_no_list_o
 
 @pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize("size", [(40, 64), (64, 48)])
-def test_a_segformer_equals_a_direct_call_of_its_library(
-    tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]
-) -> None:
+def test_a_segformer_equals_a_direct_call_of_its_library(tmp_path, rng, size):
     torch.manual_seed(0)
     model = small_segformer().eval()
     model.save_pretrained(tmp_path)
@@ -132,9 +128,7 @@ def test_a_segformer_equals_a_direct_call_of_its_library(
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize("size", [(64, 48)])
-def test_a_mask2former_gives_the_semantic_map_of_its_library_without_the_padding(
-    tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]
-) -> None:
+def test_a_mask2former_gives_the_semantic_map_of_its_library_without_the_padding(tmp_path, rng, size):
     torch.manual_seed(0)
     model = small_mask2former().eval()
     model.save_pretrained(tmp_path)

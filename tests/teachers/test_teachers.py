@@ -51,9 +51,7 @@ def test_the_palette_calls_css_colors_by_their_names(rgb: tuple[int, int, int], 
     np.testing.assert_allclose(features.sum(axis=-1), 1, rtol=1e-5)
 
 
-def test_shares_of_color_names_fall_with_the_squared_distance_to_the_nearest_color_of_each_name(
-    rng: np.random.Generator,
-) -> None:
+def test_shares_of_color_names_fall_with_the_squared_distance_to_the_nearest_color_of_each_name(rng):
     rgb, teacher = rng.integers(0, 256, (500, 3)).astype(np.uint8), PaletteTeacher()
     for row, shares in zip(lab_from_rgb(rgb), teacher.name_shares(rgb), strict=True):
         squares = [

@@ -41,9 +41,7 @@ def test_settings_that_change_a_map_change_its_space_and_the_settings(models: Pa
 
 
 @pytest.mark.parametrize("change", [{"resample": 0}, {"image_mean": [0.5, 0.5, 0.5]}, {"do_rescale": False}])
-def test_preprocessing_that_changes_a_map_changes_its_space_and_the_settings(
-    models: Path, copied: Any, change: dict[str, Any]
-) -> None:
+def test_preprocessing_that_changes_a_map_changes_its_space_and_the_settings(models, copied, change):
     other = copied("clip")
     rewrite(other / "preprocessor_config.json", **change)
     teachers = [teacher(folder) for folder in (models / "clip", other)]

@@ -145,9 +145,7 @@ def test_the_summary_head_is_applied_to_each_patch_alone(saved: Save, kind: str,
 
 @pytest.mark.parametrize("kind", JOINT)
 @pytest.mark.parametrize("wide", [False, True])
-def test_values_are_what_the_last_attention_gives_a_patch_that_sees_itself_alone(
-    saved: Save, kind: str, wide: bool
-) -> None:
+def test_values_are_what_the_last_attention_gives_a_patch_that_sees_itself_alone(saved, kind, wide):
     folder, model = saved(kind)
     image, size, grid = WIDE if wide else SQUARE
     tower = model.vision_model
@@ -186,9 +184,7 @@ def test_towers_without_a_head_give_tokens(saved: Save, kind: str) -> None:
         ("sam", "SamVisionModel"),
     ],
 )
-def test_a_folder_of_the_vision_tower_alone_gives_the_same_map(
-    saved: Save, kind: str, loader: str, tmp_path: Path
-) -> None:
+def test_a_folder_of_the_vision_tower_alone_gives_the_same_map(saved, kind, loader, tmp_path):
     folder, _ = saved(kind)
     getattr(transformers, loader).from_pretrained(folder).save_pretrained(tmp_path)
     (tmp_path / "preprocessor_config.json").write_bytes((folder / "preprocessor_config.json").read_bytes())

@@ -68,9 +68,7 @@ def test_settings_that_do_not_go_together_and_a_model_that_is_not_there_are_refu
         ),
     ],
 )
-def test_models_of_other_kinds_are_refused_with_the_kinds_that_are_known(
-    tmp_path: Path, config: dict[str, Any], message: str
-) -> None:
+def test_models_of_other_kinds_are_refused_with_the_kinds_that_are_known(tmp_path, config, message):
     (tmp_path / "config.json").write_text(json.dumps(config))
     with pytest.raises(InputError, match=message) as raised:
         teacher(tmp_path)

@@ -104,9 +104,7 @@ def test_a_tower_is_refused_for_vectors_that_it_does_not_speak_for(settings: dic
         words_of(TransformersConfig(model="nowhere", **settings), TransformersTextConfig(model="nowhere"))
 
 
-def test_a_text_tower_is_refused_for_a_vision_tower_without_a_joint_space(
-    save_joint: SaveJoint, tmp_path: Path
-) -> None:
+def test_a_text_tower_is_refused_for_a_vision_tower_without_a_joint_space(save_joint, tmp_path):
     kind = "llava"
     text = TransformersTextConfig(model=str(save_joint("clip")))
     save_vision_tower(kind, tmp_path / kind)
@@ -127,9 +125,7 @@ def features_of(folder: Path) -> GaussianFeatures:
 
 
 @pytest.mark.slow
-def test_a_scene_is_fused_and_words_are_localized_in_it(
-    room: Path, save_joint: SaveJoint, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scene_is_fused_and_words_are_localized_in_it(room, save_joint, tmp_path, capsys):
     model = save_joint("clip")
     out, boxes = tmp_path / "features", tmp_path / "boxes"
     fuse = ["fuse", str(room), "teacher=transformers", f"teacher.model={model}", "seeds.voxel=0.1", "quiet=true"]
@@ -174,9 +170,7 @@ def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str,
     assert features.shape[:2] == (3, 4)
 
 
-def test_a_tower_that_was_told_to_lower_phrases_is_found_again(
-    save_joint: SaveJoint, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_tower_that_was_told_to_lower_phrases_is_found_again(save_joint, monkeypatch, tmp_path):
     folder = save_joint("siglip", "models/joint")
     monkeypatch.setenv("GSENCODER_MODELS", str(folder.parent))
     for lower in ("yes", "no"):

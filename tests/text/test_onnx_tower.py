@@ -50,9 +50,7 @@ def test_a_graph_that_pools_itself_is_taken_at_its_word(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("mask", "length", "padding"), [(False, "any", 7), (True, 12, 9), (False, 12, 9), (True, "any", 0)]
 )
-def test_phrases_are_padded_where_the_graph_is_of_one_length_or_cannot_tell(
-    folder: Path, mask: bool, length: int | str, padding: int
-) -> None:
+def test_phrases_are_padded_where_the_graph_is_of_one_length_or_cannot_tell(folder, mask, length, padding):
     """The tokenizer pads to ten tokens, and its graph adds up all of them."""
     save_graph(folder / "model.onnx", output="sentence_embedding", mask=mask, length=length)
     rows = [2, 4, 3] + [0] * padding

@@ -76,9 +76,7 @@ def test_a_table_comes_back_from_its_file_with_the_record_of_its_tower(tower: Ha
     assert table.tower.templates == ("a {}", "the {}")
 
 
-def test_without_the_tower_its_words_work_and_an_error_says_what_to_get(
-    tower: HashTower, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_tower_its_words_work_and_an_error_says_what_to_get(tower, monkeypatch):
     monkeypatch.delenv("GSENCODER_MODELS", raising=False)
     words = words_of_table(vocabulary(tower).table)
     assert words.encode(["mug"]).shape == (1, 16)
@@ -105,9 +103,7 @@ def test_a_template_needs_one_place_for_the_phrase(config: type) -> None:
             config(templates=wrong)
 
 
-def test_a_tower_is_recognized_by_its_files_in_a_folder_of_another_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tower_is_recognized_by_its_files_in_a_folder_of_another_name(tmp_path, monkeypatch):
     for name, scale in (("another", 2.0), ("renamed", 1.0)):
         (tmp_path / name).mkdir()
         save_graph(tmp_path / name / "model.onnx", scale=scale)
@@ -167,9 +163,7 @@ def test_the_cache_answers_what_was_asked_before(tmp_path: Path, monkeypatch: py
     assert tower.asked[3:] == ["mug", "mug"]
 
 
-def test_the_cache_lies_where_the_user_says_or_among_the_caches_of_the_user(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cache_lies_where_the_user_says_or_among_the_caches_of_the_user(tmp_path, monkeypatch):
     assert cache_folder() is None
     monkeypatch.chdir(tmp_path)
     cached_vectors("identity", ("{}",), ["mug"], HashTower().embed)

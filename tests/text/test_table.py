@@ -138,9 +138,7 @@ def test_a_table_saved_in_half_precision_is_half_as_large_and_has_unit_rows(tmp_
         ({"names": np.array(["x"]), "embeddings": np.zeros((1, 0))}, "got shape"),
     ],
 )
-def test_a_table_that_is_none_says_what_is_wrong(
-    tmp_path: Path, no_jaxtyping: None, arrays: dict[str, np.ndarray], message: str
-) -> None:
+def test_a_table_that_is_none_says_what_is_wrong(tmp_path, no_jaxtyping, arrays, message):
     path = save_npz(tmp_path / "bad.npz", **arrays)
     with pytest.raises(InputError, match=message) as caught:
         load_text_table(path)
@@ -162,9 +160,7 @@ def npy(shape: tuple[int, ...], data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("shape", [(10**9, 10**9), (5, 2), (1, 1)])
-def test_a_header_that_claims_another_size_is_refused_before_memory_is_taken(
-    tmp_path: Path, shape: tuple[int, ...]
-) -> None:
+def test_a_header_that_claims_another_size_is_refused_before_memory_is_taken(tmp_path, shape):
     path = tmp_path / "bad.npz"
     names = io.BytesIO()
     np.save(names, np.array(["x", "y"]))

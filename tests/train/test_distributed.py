@@ -36,9 +36,7 @@ def test_without_a_launcher_there_is_one_process() -> None:
     ("environment", "visible", "gpu"),
     [(SLURM_TASK, 1, 0), (SLURM_TASK, 8, 1), ({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"}, 1, 1)],
 )
-def test_a_task_of_slurm_that_sees_one_gpu_takes_it(
-    environment: dict[str, str], visible: int, gpu: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_task_of_slurm_that_sees_one_gpu_takes_it(environment, visible, gpu, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: visible)
     assert gpu_index(*rank_from_environment(environment)) == gpu
 

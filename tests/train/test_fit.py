@@ -99,18 +99,14 @@ def test_a_teacher_that_no_loss_is_computed_on_is_named_in_a_warning(
     assert untrained is None or re.match(untrained, messages[0])
 
 
-def test_a_training_without_a_loss_on_any_teacher_is_refused(
-    datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_without_a_loss_on_any_teacher_is_refused(datasets, tmp_path, monkeypatch):
     only_contrast = {"field_weight": 0.0, "render_weight": 0.0, "contrast_weight": 1.0}
     with pytest.raises(InputError, match=r"the losses of every teacher have the weight 0 .*weights=\[0\.0, 1\.0\]"):
         begin(datasets, ["wall_0"], tmp_path, monkeypatch, teacher_weights=(0.0, 1.0), **only_contrast)
 
 
 @pytest.mark.parametrize(("clusters", "expected"), [(False, [True, False]), (True, [True, True])])
-def test_each_teacher_with_classes_has_a_contrast(
-    clusters: bool, expected: list[bool], datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_teacher_with_classes_has_a_contrast(clusters, expected, datasets, tmp_path, monkeypatch):
     data, *_ = begin(datasets, ["wall_0"], tmp_path, monkeypatch, contrast_clusters=clusters)
     assert [teacher.classes for teacher in data.recipe.teachers] == expected
     # The order of teachers does not matter.
@@ -119,9 +115,7 @@ def test_each_teacher_with_classes_has_a_contrast(
     assert [teacher.classes for teacher in data.recipe.teachers] == expected[::-1]
 
 
-def test_scenes_are_numbered_by_name_each_with_its_own_parts_and_others_are_validated(
-    datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scenes_are_numbered_by_name_each_with_its_own_parts_and_others_are_validated(datasets, tmp_path, monkeypatch):
     data, validated, _ = begin(datasets, ["wall_2", "wall_0"], tmp_path, monkeypatch)
     assert [scene.name for scene in data.scenes] == ["wall_0", "wall_2"]
     assert [[part.name if part else None for part in scene.parts] for scene in data.scenes] == [
@@ -131,9 +125,7 @@ def test_scenes_are_numbered_by_name_each_with_its_own_parts_and_others_are_vali
     assert validated == ["wall_1"]
 
 
-def test_the_heads_of_the_render_loss_go_to_the_teacher_that_has_them(
-    datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_heads_of_the_render_loss_go_to_the_teacher_that_has_them(datasets, tmp_path, monkeypatch):
     assert begin(datasets, ["wall_0"], tmp_path, monkeypatch)[2] == {"dense": []}
     head = Head(name="siglip.summary", body=torch.nn.Sequential(torch.nn.Linear(4, 3)))
     measured = MeasuredHead(head=head, mean=np.arange(3, dtype=np.float32), scale=2.0, cells=5, cosine=0.9, worst=0.5)

@@ -57,13 +57,11 @@ def rendered_cosine(memory: QueryMemory) -> float:
     scene = wall(0)
     teacher = BlendedTeacher(scene)
     cosines = []
-    assert scene.views is not None
     assert scene.gaussians is not None
     for view in range(2):
         target = teacher.feature_map(scene.views, view)
         b = blend(scene.gaussians, scene.views.cameras, view, like=target)
         features, alpha = render_features(memory, b)
-        assert target.features is not None
         truth = target.features.reshape(len(features), -1)
         good = (alpha > 0.5) & np.isfinite(truth[:, 0])
         a, b_ = features[good] - memory.mean, truth[good] - memory.mean
@@ -83,9 +81,7 @@ def test_fused_features_are_a_memory_before_any_training(prepared: MemoryScene) 
 
 
 @pytest.mark.parametrize(("scoring", "init"), [("centered", "fused"), ("cosine", "random"), ("dot", "random")])
-def test_training_brings_rendered_features_to_the_teachers(
-    prepared: MemoryScene, tmp_path: Path, scoring: str, init: str
-) -> None:
+def test_training_brings_rendered_features_to_the_teachers(prepared, tmp_path, scoring, init):
     config = MemoryConfig(channels=6, scoring=scoring, init=init, temperature=1.0 if scoring == "dot" else 0.05)  # type: ignore[arg-type]
     before = rendered_cosine(untrained_memory(prepared, config))
     memories, state = train_memory({"hidden": prepared}, config, LONG, work=tmp_path)
@@ -95,9 +91,7 @@ def test_training_brings_rendered_features_to_the_teachers(
     assert after > max(before, 0.95 if scoring != "dot" else 0.8)
 
 
-def test_joint_training_gives_what_teachers_alone_give(
-    prepared: MemoryScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_joint_training_gives_what_teachers_alone_give(prepared, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "CLIP", float("inf"))
     other = prepared_wall(tmp_path, "other")
     both = {"hidden": prepared, "other": other}
@@ -201,7 +195,6 @@ def test_unseen_gaussians_take_no_part_in_what_a_memory_renders(prepared: Memory
     memory = untrained_memory(prepared, MemoryConfig(channels=4))
     scene = wall(0)
     assert scene.gaussians is not None
-    assert scene.views is not None
     b = blend(scene.gaussians, scene.views.cameras, 0)
     weights = memory.weights.copy()
     weights[::3] = 0
@@ -365,9 +358,7 @@ def test_gaussians_without_a_feature_have_no_query_before_and_after_the_training
         assert memory.queries[predicted.seen].all(axis=1).all()
 
 
-def test_a_preparation_that_was_cut_off_is_not_continued_with_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_preparation_that_was_cut_off_is_not_continued_with_others(tmp_path, monkeypatch):
     """Maps and a sample say nothing of what they were made from."""
 
     def cut_off(*arguments: object, **settings: object) -> None:
@@ -411,9 +402,7 @@ def in_a_basis(predicted: GaussianFeatures) -> GaussianFeatures:
 
 
 @pytest.mark.parametrize(("basis", "least"), [(True, 0.2), (False, 0.8)])
-def test_the_fit_is_how_far_rendered_features_are_from_the_teachers_maps_in_all_views(
-    tmp_path: Path, basis: bool, least: float
-) -> None:
+def test_the_fit_is_how_far_rendered_features_are_from_the_teachers_maps_in_all_views(tmp_path, basis, least):
     predicted = predicted_features()
     made = prepared_from(tmp_path / "made", in_a_basis(predicted) if basis else predicted)
     assert (made.outputs.basis is not None) == basis
@@ -422,11 +411,9 @@ def test_the_fit_is_how_far_rendered_features_are_from_the_teachers_maps_in_all_
     memory = untrained_memory(made, config)
     scene = wall(0)
     assert scene.gaussians is not None
-    assert scene.views is not None
     teacher, tally = BlendedTeacher(scene), RenderedTally(memory.mean)
     for view in range(2):
         target = teacher.feature_map(scene.views, view)
-        assert target.features is not None
         truth = target.features.reshape(-1, 12)
         b = blend(scene.gaussians, scene.views.cameras, view, like=target, config=BlendConfig(rays_per_patch=4))
         queries, alpha = render_queries(memory, b)
@@ -440,9 +427,7 @@ def test_the_fit_is_how_far_rendered_features_are_from_the_teachers_maps_in_all_
     assert errors.l2 == pytest.approx(expected.l2, rel=2e-2)
 
 
-def test_raw_features_are_stored_beside_the_bank_when_they_are_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_raw_features_are_stored_beside_the_bank_when_they_are_asked_for(tmp_path, monkeypatch):
     scene = wall(0)
     assert scene.views is not None
     teacher = BlendedTeacher(scene)

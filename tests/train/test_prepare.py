@@ -62,7 +62,6 @@ def test_a_prepared_scene_gives_back_its_gaussians_and_cameras(tmp_path: Path) -
     dataset, names = prepared(tmp_path, count=1)
     one, source = dataset.scenes(names)[0], scene(0)
     assert source.gaussians is not None
-    assert source.views is not None
     rows = np.array([3, 1, 4])
     chosen = one.gaussians(rows)
     for name in ("means", "quats", "scales", "opacities", "sh"):
@@ -235,9 +234,7 @@ def test_clusters_stand_for_names_where_there_are_none() -> None:
 
 @pytest.mark.parametrize("teacher", [SideTeacher(), DenseSideTeacher()], ids=["coded", "dense"])
 @pytest.mark.parametrize(("center", "scale"), [(True, True), (True, False), (False, True), (False, False)])
-def test_targets_are_centered_and_scaled_only_where_that_is_asked(
-    teacher: SideTeacher, center: bool, scale: bool
-) -> None:
+def test_targets_are_centered_and_scaled_only_where_that_is_asked(teacher, center, scale):
     config = replace(PREPARE, basis_views=2, center=center, scale=scale)
     outputs, codebook, _ = dataset_space([Path("a")], lambda path: (scene(0), teacher), config)
     expected = (TABLE - (outputs.mean if center else 0)) / (outputs.scale / 2 if scale else 1)
@@ -248,9 +245,7 @@ def test_targets_are_centered_and_scaled_only_where_that_is_asked(
 
 
 @pytest.mark.parametrize("teacher", [SideTeacher(), DenseSideTeacher()], ids=["coded", "dense"])
-def test_a_scene_that_is_prepared_on_another_device_is_the_same_within_rounding(
-    tmp_path: Path, teacher: SideTeacher
-) -> None:
+def test_a_scene_that_is_prepared_on_another_device_is_the_same_within_rounding(tmp_path, teacher):
     dataset, _ = prepared(tmp_path, count=1)
     outputs = dataset.load_space()[0]
     prepare_scene(tmp_path / "cpu.safetensors", scene(0), teacher, outputs, PREPARE)
@@ -303,9 +298,7 @@ def test_cells_of_the_render_loss_lie_where_their_pixels_do(tmp_path: Path) -> N
     np.testing.assert_allclose(vectors, expected, atol=5e-3)
 
 
-def test_gaussians_that_are_left_after_dropping_keep_their_own_targets(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gaussians_that_are_left_after_dropping_keep_their_own_targets(tmp_path, monkeypatch):
     dataset, names = prepared(tmp_path, count=1)
     monkeypatch.setattr("gsencoder.train.samples.drop_random", lambda rows, share, rng: rows[1::3])
     data = samples(dataset, names, sampling=SamplingConfig(views=2, gaussians=0))
@@ -357,9 +350,7 @@ def assert_within_half_a_step(rounded: np.ndarray, exact: np.ndarray) -> None:
     assert (error.max(axis=0) > HALF_STEP / 2 * largest).all()
 
 
-def test_targets_and_the_vectors_of_rows_are_within_half_a_step_of_float16(
-    both: tuple[PreparedScene, PreparedScene],
-) -> None:
+def test_targets_and_the_vectors_of_rows_are_within_half_a_step_of_float16(both):
     wide, narrow = both
     assert (wide.precision, narrow.precision) == ("float16", "int8")
     rows = np.arange(len(wide))
@@ -381,9 +372,7 @@ def test_all_else_is_the_same_and_targets_take_half_the_bytes(both: tuple[Prepar
             np.testing.assert_array_equal(narrow[name], values)
 
 
-def test_a_scene_of_the_other_type_in_a_folder_is_refused(
-    both: tuple[PreparedScene, PreparedScene], tmp_path: Path
-) -> None:
+def test_a_scene_of_the_other_type_in_a_folder_is_refused(both, tmp_path):
     for config, fits, other in ((PREPARE, *both), (replace(PREPARE, targets="int8"), *reversed(both))):
         dataset = PreparedDataset(tmp_path / config.targets, {"prepare": plain(config)})
         path = dataset.scene_path("wall_0")
@@ -462,7 +451,6 @@ def test_the_basis_is_of_the_maps_of_the_scenes_that_have_the_teacher(monkeypatc
     outputs, _, _ = dataset_space(WALLS, open_scene, config, optional=True)
     np.testing.assert_allclose(outputs.mean, every.mean(axis=0), rtol=1e-6)
     assert outputs.scale**2 == pytest.approx(np.trace(np.cov(every.T, bias=True)), rel=1e-5)
-    assert outputs.basis is not None
     values, vectors = np.linalg.eigh(np.cov(every.T, bias=True))
     np.testing.assert_allclose(np.abs(outputs.basis.components[0] @ vectors[:, values.argmax()]), 1, atol=1e-4)
 
@@ -507,9 +495,7 @@ def prepare_both(folder: Path) -> dict[str, PreparedDataset]:
 
 
 @pytest.mark.usefixtures("reader")
-def test_a_scene_is_prepared_for_each_teacher_that_it_has_and_again_where_its_file_was_removed(
-    tmp_path: Path,
-) -> None:
+def test_a_scene_is_prepared_for_each_teacher_that_it_has_and_again_where_its_file_was_removed(tmp_path):
     datasets = prepare_both(tmp_path)
     paths = {}
     for name, dataset in datasets.items():
@@ -538,9 +524,7 @@ class PathOfModel(Reader):
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("name", ["palette", "clip"])
-def test_errors_name_the_options_of_one_of_several_teachers_as_they_are_typed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_errors_name_the_options_of_one_of_several_teachers_as_they_are_typed(tmp_path, monkeypatch, name):
     monkeypatch.setattr(prepare_module, "SceneReader", PathOfModel)
     typed = rf"teachers\.{name}\.model: no file at teacher\.onnx or a/teacher\.model; lower teachers\.{name}\.size="
     config = SourceConfig(teachers={name: OnnxConfig(), "dense": PaletteConfig()}, prepare=PREPARE)
@@ -559,9 +543,7 @@ def test_names_of_teachers_that_differ_only_in_case_are_refused() -> None:
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("world", [1, 2])
-def test_a_process_among_several_says_at_once_why_it_stops(
-    world: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_among_several_says_at_once_why_it_stops(world, tmp_path, monkeypatch):
     def fails(*_: object, **__: object) -> None:
         raise InputError("its own")
 

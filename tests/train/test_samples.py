@@ -65,9 +65,7 @@ def test_a_sample_depends_on_the_seed_and_its_number_alone(dataset: tuple[Prepar
 
 
 @given(st.integers(1, 3), st.integers(1, 3), st.integers(1, 4), st.integers(0, 3), st.integers(1, 3))
-def test_processes_share_a_step_and_a_resumed_run_goes_on_in_the_middle(
-    batch: int, accumulate: int, world: int, first: int, steps: int
-) -> None:
+def test_processes_share_a_step_and_a_resumed_run_goes_on_in_the_middle(batch, accumulate, world, first, steps):
     def numbers(rank: int, begin: int) -> list[list[int]]:
         return micro_batches(begin, first + steps, batch=batch, accumulate=accumulate, rank=rank, world=world)
 
@@ -88,11 +86,9 @@ def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[Prepar
     for scene in data.scenes:
         if sample.name.startswith(scene.name):
             source = scene
-    assert source is not None
     assert len(sample.attributes) == len(source.first)
     everything = np.arange(len(source.first))
     (targets,), (part,) = sample.teachers, source.parts
-    assert part is not None
     np.testing.assert_array_equal(targets.targets.numpy(), part.targets(everything))
     assert ((targets.loss_weights > 0).numpy() == (part.weights > 0)).all()
 
@@ -117,9 +113,7 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
 
 
 @pytest.mark.parametrize("most", [1, 2])
-def test_of_many_scenes_the_latest_used_are_kept_open(
-    dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
+def test_of_many_scenes_the_latest_used_are_kept_open(dataset, monkeypatch, most):
     monkeypatch.setattr("gsencoder.train.samples.MAX_OPEN_FILES", most)
     data, used = samples(*dataset), list[str]()
     for number in range(9):
@@ -145,9 +139,7 @@ def in_units(scene: PreparedScene, metres: float | None) -> PreparedScene:
 
 
 @pytest.mark.parametrize(("metres", "voxel"), [(0.5, 0.2), (2.0, 0.05), (None, 0.1)])
-def test_the_grid_has_the_encoders_voxel_in_metres(
-    dataset: tuple[PreparedDataset, list[str]], metres: float | None, voxel: float
-) -> None:
+def test_the_grid_has_the_encoders_voxel_in_metres(dataset, metres, voxel):
     """So many metres a unit are so many times fewer units a voxel; an unknown unit is taken for the metre."""
     assert SMALL.voxel == 0.1
     recipe = samples(*dataset, augmentation=None).recipe
@@ -158,9 +150,7 @@ def test_the_grid_has_the_encoders_voxel_in_metres(
     assert same(sample, expected)
 
 
-def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
-    dataset: tuple[PreparedDataset, list[str]], tmp_path: Path
-) -> None:
+def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(dataset, tmp_path):
     path = Path(shutil.copy(dataset[0].scenes(dataset[1])[0].path, tmp_path))
     arrays = load_file(path)
     rewrite(path, {**arrays, "weights": np.where(np.arange(len(arrays["means"])) % 5 == 0, 0, arrays["weights"])})
@@ -181,9 +171,7 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
 @pytest.mark.parametrize(
     "sampling", [SamplingConfig(views=2, gaussians=200, rare_centers=0.0), SamplingConfig(gaussians=0)]
 )
-def test_where_all_weights_are_1_samples_are_the_same_without_looking_up_classes(
-    dataset: tuple[PreparedDataset, list[str]], sampling: SamplingConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_all_weights_are_1_samples_are_the_same_without_looking_up_classes(dataset, sampling, monkeypatch):
     data = samples(*dataset, sampling=sampling, losses=LossConfig(rarity=0.0, contrast_weight=0.0))
     assert not data.recipe.uses_classes(data.recipe.teachers[0])
     without = [data[number] for number in range(4)]
@@ -204,9 +192,7 @@ def test_where_all_weights_are_1_samples_are_the_same_without_looking_up_classes
         {"losses": LossConfig(rarity=0.5, contrast_weight=0.0)},
     ],
 )
-def test_classes_are_looked_up_for_rare_centers_contrast_or_weights_of_rare_classes(
-    dataset: tuple[PreparedDataset, list[str]], changes: dict[str, Any]
-) -> None:
+def test_classes_are_looked_up_for_rare_centers_contrast_or_weights_of_rare_classes(dataset, changes):
     nothing = {
         "sampling": SamplingConfig(views=2, gaussians=200, rare_centers=0.0),
         "losses": LossConfig(rarity=0.0, contrast_weight=0.0),
@@ -215,9 +201,7 @@ def test_classes_are_looked_up_for_rare_centers_contrast_or_weights_of_rare_clas
     assert recipe.uses_classes(recipe.teachers[0])
 
 
-def test_all_kinds_are_equally_often_the_center_of_a_sample(
-    dataset: tuple[PreparedDataset, list[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_kinds_are_equally_often_the_center_of_a_sample(dataset, monkeypatch):
     recipe, drawn = samples(*dataset).recipe, list[np.ndarray]()
 
     def record(means: np.ndarray, cameras: Cameras, center_weights: np.ndarray, *rest: Any) -> Any:
@@ -230,7 +214,6 @@ def test_all_kinds_are_equally_often_the_center_of_a_sample(
     for part in dataset[0].scenes(dataset[1]):
         scene = TrainingScene([part])
         (codes,) = target_codes(scene, recipe)
-        assert codes is not None
         make_sample(scene, (codes,), recipe, 200, np.random.default_rng(0))
         assert (drawn[-1][codes < 0] == 0).all()
         np.add.at(sums, codes[codes >= 0], drawn[-1][codes >= 0])
@@ -268,9 +251,7 @@ ALL = np.arange(4)
         ([0.2, 0.6, 0.0, 0.0], ALL, np.array([0, 2, 3]), False),  # too much was
     ],
 )
-def test_rows_stay_where_they_mean_something(
-    row: list[float] | None, selected: np.ndarray, kept: np.ndarray, stays: bool
-) -> None:
+def test_rows_stay_where_they_mean_something(row, selected, kept, stays):
     view = rows_of([row or [1.0, 0, 0, 0], [1.0, 0, 0, 0]], [row is not None, True])
     restricted = restrict_rows(view, 4, selected, kept, LossConfig())
     assert restricted.targets.ravel().tolist() == ([0.0, 1.0] if stays else [1.0])
@@ -306,7 +287,6 @@ def test_views_that_see_nothing_are_named(dataset: tuple[PreparedDataset, list[s
     data = samples(*dataset)
     scene = data.scenes[0]
     (part,) = scene.parts
-    assert part is not None
     part._header[0].cam_from_world[:, 2, 3] -= 1000  # Both cameras now stand behind the wall and look away.
     data = SampleDataset([scene], replace(data.recipe, augmentation=Augmentation()))
     with pytest.raises(InputError, match=r"scene wall_0: sample: no Gaussian"):
@@ -514,9 +494,7 @@ def test_heads_of_a_teacher_are_in_its_render_loss_and_in_no_other_term(datasets
             torch.testing.assert_close(terms[term], plain[term])
 
 
-def test_centers_are_drawn_by_the_classes_of_the_first_teacher_that_a_scene_has(
-    datasets: Datasets, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_centers_are_drawn_by_the_classes_of_the_first_teacher_that_a_scene_has(datasets, monkeypatch):
     data = joint(datasets)
     given: list[np.ndarray] = []
 

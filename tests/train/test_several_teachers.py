@@ -40,7 +40,6 @@ def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alo
     both = Distillation(small_encoder(), LOSSES, data.recipe.teachers)
     terms, divisors = both.terms(predicted, batch), both.divisors(batch)
     sum(terms[name] for name in terms).backward()
-    assert predicted.grad is not None
     for number, name in enumerate(datasets):
         alone = Distillation(small_encoder(), LOSSES, data.recipe.teachers[number : number + 1])
         own = batch._replace(teachers=batch.teachers[number : number + 1])
@@ -86,7 +85,6 @@ def test_a_scene_that_lacks_a_teacher_has_no_weight_in_its_terms(datasets: Datas
     predicted = torch.randn(len(batch.attributes), 8, requires_grad=True)
     terms = distillation.terms(predicted, batch)
     sum(terms.values()).backward()
-    assert predicted.grad is not None
     assert terms["heights/field"].item() == terms["heights/render"].item() == terms["heights/contrast"].item() == 0
     assert (predicted.grad[:, 4:] == 0).all()
     assert (predicted.grad[:, :4] != 0).any()
@@ -194,7 +192,6 @@ def test_classes_are_counted_again_when_a_scene_gains_the_teacher(tmp_path: Path
 def test_files_of_other_gaussians_are_refused(datasets: Datasets, tmp_path: Path) -> None:
     other, _ = prepared(tmp_path / "other", count=1, teacher=HeightTeacher())
     moved = scene(0)
-    assert moved.gaussians is not None
     other.scene_path("wall_0").unlink()
     shifted = replace(moved, gaussians=replace(moved.gaussians, means=moved.gaussians.means + np.float32(1e-3)))
     other.prepare(shifted, HeightTeacher(), PREPARE, source=Path("wall_0"))

@@ -51,9 +51,7 @@ def test_training_brings_the_loss_down(dataset: Prepared, tmp_path: Path) -> Non
     assert np.mean(curve[-5:]) < 0.8 * np.mean(curve[:5])
 
 
-def test_a_sample_that_cannot_be_made_stops_the_run_in_its_own_words(
-    dataset: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sample_that_cannot_be_made_stops_the_run_in_its_own_words(dataset, tmp_path, monkeypatch):
     one = trainer(dataset, tmp_path)
     refused = InputError("scene wall_1: its file is gone")
     monkeypatch.setattr("gsencoder.train.samples.make_sample", lambda *_: (_ for _ in ()).throw(refused))
@@ -104,9 +102,7 @@ def _fix_turns(encoder: torch.nn.Module) -> None:
         module.training = False
 
 
-def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the_scene(
-    dataset: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the_scene(dataset, tmp_path, monkeypatch):
     data = samples(*dataset)
     for number in range(len(data.scenes)):
         data[number]  # Kinds of targets are looked up once, and here before they are spoiled.
@@ -229,9 +225,7 @@ def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, tmp_pat
 
 
 @pytest.mark.parametrize(("cause", "saved"), [(Stopped(15), True), (KeyboardInterrupt(), True), (None, False)])
-def test_a_stop_that_compiled_code_wraps_is_a_stop(
-    dataset: Prepared, tmp_path: Path, cause: BaseException | None, saved: bool
-) -> None:
+def test_a_stop_that_compiled_code_wraps_is_a_stop(dataset, tmp_path, cause, saved):
     def stop_at_three(steps: range, label: str):
         for step in steps:
             if step == 3:

@@ -66,9 +66,7 @@ def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int, befo
 
 
 @pytest.mark.alone
-def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_one(
-    dataset: Prepared, tmp_path: Path, ranks: RankServer
-) -> None:
+def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_one(dataset, tmp_path, ranks):
     alone = script(dataset, tmp_path / "one", steps=4, accumulate=2)
     pair = script(dataset, tmp_path / "two", steps=4, accumulate=1, before=EIGHT_GPUS)
     ranks.started(alone, count=1).end_well()

@@ -1,7 +1,6 @@
 """What `train`, `encode` and `evaluate weights=` refuse, and what they leave alone."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 from command_runs import QUICK, refusal
@@ -22,9 +21,7 @@ pytestmark = pytest.mark.slow
         (["device=cuda"], "no GPU"),
     ],
 )
-def test_a_training_that_cannot_be_is_refused_in_one_line(
-    rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
+def test_a_training_that_cannot_be_is_refused_in_one_line(rooms, tmp_path, capsys, words, message):
     table = [] if "teacher=radio" in words else [f"teacher.words={rooms / 'words.safetensors'}"]
     assert message in refusal(
         capsys, "train", str(rooms / "room_0"), str(rooms / "room_1"), *table, f"out={tmp_path / 'out'}", *words
@@ -40,18 +37,14 @@ def test_a_training_that_cannot_be_is_refused_in_one_line(
         (["encode.device=cuda"], "sees no GPU"),
     ],
 )
-def test_an_encoding_that_cannot_be_is_refused_in_one_line(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
+def test_an_encoding_that_cannot_be_is_refused_in_one_line(rooms, trained, tmp_path, capsys, words, message):
     options = [] if any(word.startswith("weights=") for word in words) else [f"weights={trained}"]
     line = refusal(capsys, "encode", str(rooms / "room_2"), *options, f"out={tmp_path / 'out'}", *words)
     assert message in line
     assert not (tmp_path / "out").exists()
 
 
-def test_features_of_another_space_are_not_judged_by_these_words(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_features_of_another_space_are_not_judged_by_these_words(rooms, trained, tmp_path, capsys):
     other = tmp_path / "other.safetensors"
     table = load_text_table(rooms / "words.safetensors")
     save_text_table(other, make_text_table(table.names, table.embeddings, "other-words"))
@@ -68,9 +61,7 @@ def test_features_of_another_space_are_not_judged_by_these_words(
     assert "other-words" in line
 
 
-def test_two_scenes_of_one_name_and_one_scene_named_twice_are_refused(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_scenes_of_one_name_and_one_scene_named_twice_are_refused(rooms, trained, tmp_path, capsys):
     for name in ("a", "b"):
         shutil.copytree(rooms / "room_0", tmp_path / name / "room")
     both = [str(tmp_path / "a" / "room"), str(tmp_path / "b" / "room")]
@@ -84,9 +75,7 @@ def test_two_scenes_of_one_name_and_one_scene_named_twice_are_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_weights_are_not_replaced_by_what_they_make(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_weights_are_not_replaced_by_what_they_make(rooms, trained, tmp_path, capsys):
     own = tmp_path / "encoder"
     shutil.copytree(trained, own)
     problem = refusal(capsys, "encode", str(rooms / "room_0"), f"weights={own}", f"out={own}", "overwrite=true")
@@ -94,9 +83,7 @@ def test_weights_are_not_replaced_by_what_they_make(
     assert (own / "encoder.safetensors").is_file()
 
 
-def test_folders_that_a_training_did_not_make_are_left_alone(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_folders_that_a_training_did_not_make_are_left_alone(rooms, trained, tmp_path, capsys):
     scenes = [str(rooms / f"room_{number}") for number in range(2)]
     prepared = f"prepared={trained.with_name('encoder.prepared')}"
     common = ["train", *scenes, f"teacher.words={rooms / 'words.safetensors'}", *QUICK[1:], "tensorboard=false"]
@@ -124,9 +111,7 @@ def test_folders_that_a_training_did_not_make_are_left_alone(
         "loss.cosine=0 loss.smooth_l1=0 loss.contrast_weight=0",
     ],
 )
-def test_sizes_that_nobody_means_are_refused_before_the_work(
-    rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str
-) -> None:
+def test_sizes_that_nobody_means_are_refused_before_the_work(rooms, tmp_path, capsys, setting):
     problem = refusal(capsys, "train", str(rooms / "room_0"), *setting.split(), f"out={tmp_path / 'out'}")
     assert setting.partition("=")[0].rpartition(".")[2] in problem
     assert list(tmp_path.iterdir()) == []

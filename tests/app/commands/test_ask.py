@@ -39,9 +39,7 @@ def test_a_question_is_answered_from_views_of_what_it_names(features: Path, tmp_
     assert KEY.encode() not in everything
 
 
-def test_a_key_of_the_command_line_is_written_nowhere(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_key_of_the_command_line_is_written_nowhere(features, tmp_path, capsys):
     with serving(answer("fine")) as server:
         words = ("question=What is the cube?", f"vlm.base_url={server.url}", "vlm.key=sk-of-the-line")
         assert ask(features, tmp_path / "answer", *words) == 0
@@ -65,9 +63,7 @@ def test_a_dry_run_writes_prompt_and_pictures_and_asks_nobody(features: Path, tm
     assert {path.name for path in out.iterdir()} >= {"request.json", "sheet.png", "view_00.png", "summary.json"}
 
 
-def test_things_are_numbered_where_that_is_asked_for_and_absent_words_stand_in_the_prompt(
-    features: Path, tmp_path: Path
-) -> None:
+def test_things_are_numbered_where_that_is_asked_for_and_absent_words_stand_in_the_prompt(features, tmp_path):
     words = ("question=How many are there?", "query=crate,pen holder", "dry_run=true")
     assert ask(features, tmp_path / "plain", *words) == 0
     text = (tmp_path / "plain" / "prompt.txt").read_text()
@@ -80,9 +76,7 @@ def test_things_are_numbered_where_that_is_asked_for_and_absent_words_stand_in_t
     assert "1 = crate; 2 = crate." in (tmp_path / "marked" / "prompt.txt").read_text()
 
 
-def test_a_tower_is_not_ignored_where_the_file_of_words_was_lost(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_tower_is_not_ignored_where_the_file_of_words_was_lost(features, tmp_path, capsys):
     folder = shutil.copytree(features, tmp_path / "features")
     (folder / "words.safetensors").unlink()
     words = ("question=Where is it?", "dry_run=true", "text=onnx", "text.model=nowhere")
@@ -147,9 +141,7 @@ def test_a_question_that_names_nothing_is_shown_even_frames_and_says_so(features
         (("question=the cube", "task=ground", "ask.marks=false", "dry_run=true"), "needs marks"),
     ],
 )
-def test_what_cannot_be_asked_ends_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], problem: str
-) -> None:
+def test_what_cannot_be_asked_ends_in_one_line(features, tmp_path, capsys, words, problem):
     assert ask(features, tmp_path / "out", *words) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1

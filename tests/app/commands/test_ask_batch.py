@@ -31,9 +31,7 @@ def batch(path: Path, *rows: Any) -> Path:
     return path
 
 
-def test_a_batch_that_a_fault_ends_keeps_its_answers_and_goes_on(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_batch_that_a_fault_ends_keeps_its_answers_and_goes_on(features, tmp_path, capsys):
     file = batch(
         tmp_path / "q.jsonl",
         {"id": "a", "question": "Where is the cube?"},
@@ -82,9 +80,7 @@ def crate_refused(handler: Handler, body: Any) -> None:
         answer("about " + text.rpartition("Question: ")[2])(handler, body)
 
 
-def test_a_question_that_is_refused_keeps_no_other_from_its_answer(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_question_that_is_refused_keeps_no_other_from_its_answer(features, tmp_path, capsys):
     cube, crate, wall = ({"id": name, "question": f"Where is the {name}?"} for name in ("cube", "crate", "wall"))
     lost = {"id": "lost", "task": "ground", "question": "the far one"}
     file, out = tmp_path / "q.jsonl", tmp_path / "out"
@@ -141,9 +137,7 @@ def test_features_that_were_replaced_are_asked_anew(features: Path, tmp_path: Pa
         assert ask(folder, tmp_path / "out", *words, "overwrite=true") == 0
 
 
-def test_warnings_of_a_batch_name_the_question(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_warnings_of_a_batch_name_the_question(features, tmp_path, capsys):
     file = batch(tmp_path / "q.jsonl", {"id": "a", "question": "How large?"}, {"id": "b", "question": "How high?"})
     assert ask(features, tmp_path / "out", f"questions={file}", "dry_run=true") == 0
     output = capsys.readouterr().err
@@ -153,9 +147,7 @@ def test_warnings_of_a_batch_name_the_question(
     assert all("names nothing to look for" in row["warnings"][0] for row in rows)
 
 
-def test_pictures_are_rendered_once_for_questions_about_one_thing(
-    features: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_are_rendered_once_for_questions_about_one_thing(features, monkeypatch):
     rendered: list[int] = []
 
     def counted(*arguments: Any, **named: Any) -> Any:
@@ -207,9 +199,7 @@ def test_lines_take_the_task_of_the_command_unless_they_name_one(tmp_path: Path)
         (b"\x80\x04]", "is a pickle, which is refused since reading it can run code"),
     ],
 )
-def test_files_of_questions_that_are_wrong_say_where(
-    tmp_path: Path, content: bytes, problem: str, no_jaxtyping: None
-) -> None:
+def test_files_of_questions_that_are_wrong_say_where(tmp_path, content, problem, no_jaxtyping):
     (tmp_path / "q.jsonl").write_bytes(content)
     with pytest.raises(InputError) as caught:
         read_questions(tmp_path / "q.jsonl")
@@ -218,9 +208,7 @@ def test_files_of_questions_that_are_wrong_say_where(
         read_questions(tmp_path / "other.jsonl")
 
 
-def test_a_file_that_cannot_be_written_ends_a_set_and_counts_for_no_question(
-    features: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_cannot_be_written_ends_a_set_and_counts_for_no_question(features, tmp_path, monkeypatch, capsys):
     row = {"scene_id": "room", "question_id": "1", "question": "Where is the cube?", "answers": ["here"]}
     (tmp_path / "ScanQA_v1.0_val.json").write_text(json.dumps([row]))
     rename, fault = os.replace, [OSError(errno.EIO, os.strerror(errno.EIO))]

@@ -105,9 +105,7 @@ MISSPELT += ("--key", "-key", "--vlm.key", "vlm", "@vlm.key")
 
 
 @pytest.mark.parametrize("flags", [(), ("--debug",), ("--cfg",), ("-m", "out=o")])
-def test_a_secret_whose_option_is_misspelt_is_not_repeated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...]
-) -> None:
+def test_a_secret_whose_option_is_misspelt_is_not_repeated(tmp_path, capsys, flags):
     words = [f"{name}={KEY}" for name in (MISSPELT if not flags else MISSPELT[:2])]
     for word in [*words, f"vlm={{key: {KEY}}}"]:
         assert cli.main(["ask", str(tmp_path), "question=x", word, *flags]) == 2

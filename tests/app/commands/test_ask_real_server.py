@@ -55,9 +55,7 @@ def real_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str,
 
 
 @pytest.mark.parametrize("task", ["answer", "ground", "caption"])
-def test_a_real_server_takes_what_is_sent_and_answers(
-    features: Path, tmp_path: Path, real_server: tuple[str, str], task: str
-) -> None:
+def test_a_real_server_takes_what_is_sent_and_answers(features, tmp_path, real_server, task):
     url, model = real_server
     words = (f"vlm.base_url={url}", f"vlm.model={model}", "vlm.max_tokens=12")
     question = "" if task == "caption" else "Where is the crate?"
@@ -68,9 +66,7 @@ def test_a_real_server_takes_what_is_sent_and_answers(
     assert row["tokens"]["prompt"] > 10
 
 
-def test_a_real_server_refuses_another_model_in_its_own_words(
-    features: Path, tmp_path: Path, real_server: tuple[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_real_server_refuses_another_model_in_its_own_words(features, tmp_path, real_server, capsys):
     url, _ = real_server
     assert ask(features, tmp_path / "out", f"vlm.base_url={url}", "vlm.model=other", "question=Is it the cube?") == 2
     output = capsys.readouterr().err

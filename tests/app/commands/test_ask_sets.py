@@ -127,9 +127,7 @@ def test_questions_of_other_scenes_are_counted_and_named(home: Path, tmp_path: P
     assert (tmp_path / "one" / ROOMS[0] / "00001" / "request.json").is_file()
 
 
-def test_refused_questions_cost_no_other_its_answer_and_a_broken_set_goes_on(
-    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refused_questions_cost_no_other_its_answer_and_a_broken_set_goes_on(home, tmp_path, capsys):
     statuses, seen = [400, 500], list[Any]()
 
     def stops(handler: Handler, body: Any) -> None:
@@ -155,9 +153,7 @@ def test_refused_questions_cost_no_other_its_answer_and_a_broken_set_goes_on(
     assert "1 of " in capsys.readouterr().err
 
 
-def test_a_set_and_folders_that_do_not_fit_end_in_one_line(
-    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_set_and_folders_that_do_not_fit_end_in_one_line(home, tmp_path, capsys):
     features, file = str(home / "features"), f"questions={home / 'set' / 'questions.json'}"
     (tmp_path / "empty").mkdir()
     lines = tmp_path / "lines.jsonl"

@@ -54,7 +54,6 @@ def test_training_states_what_the_basis_keeps_of_its_scenes_and_of_held_out_ones
     outputs = spaces.select()
     figures = results_of(folder / "encoder")["basis"]
     assert made_by["basis"] == figures
-    assert outputs.basis is not None
     assert (figures["rank"], figures["energy_kept"]) == (3, outputs.basis.energy_kept)
     views = load_scene(folder / "room_1").views
     assert views is not None
@@ -62,9 +61,7 @@ def test_training_states_what_the_basis_keeps_of_its_scenes_and_of_held_out_ones
     assert {name: figures[name] for name in direct.figures()} == pytest.approx(direct.figures(), abs=1e-3)
 
 
-def test_encoding_shows_the_figures_of_the_weights_or_those_of_the_scene(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_encoding_shows_the_figures_of_the_weights_or_those_of_the_scene(folder, tmp_path, capsys):
     trained = results_of(folder / "encoder")["basis"]
     encode = ["encode", str(folder / "room_0"), f"weights={folder / 'encoder'}"]
     assert cli.main([*encode, f"out={tmp_path / 'plain'}"]) == 0
@@ -79,23 +76,17 @@ def test_encoding_shows_the_figures_of_the_weights_or_those_of_the_scene(
     assert measured["other_energy"] != trained["other_energy"]
 
 
-def test_fusing_in_the_basis_of_weights_gives_features_that_compare_with_encoded_ones(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_fusing_in_the_basis_of_weights_gives_features_that_compare_with_encoded_ones(folder, tmp_path):
     words = [str(folder / "room_0"), "teacher=palette", f"basis={folder / 'encoder'}", f"out={tmp_path / 'fused'}"]
     assert cli.main(["fuse", *words, "quiet=true"]) == 0
     basis = load_weights(folder / "encoder")[1].select().basis
     (features,) = load_features(tmp_path / "fused").features.values()
     fused = features.basis
-    assert basis is not None
-    assert fused is not None
     np.testing.assert_array_equal(fused.components, basis.components)
     assert 0 < results_of(tmp_path / "fused")["other_energy"] <= 1
 
 
-def test_where_there_is_nothing_to_measure_one_line_says_so(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_there_is_nothing_to_measure_one_line_says_so(folder, tmp_path, capsys):
     save_splat(tmp_path / "bare.ply", random_cloud(50, 0.02))
     out = [f"out={tmp_path / 'out'}", "quiet=true", "data.metres_per_unit=1"]
     weights = f"weights={folder / 'encoder'}"

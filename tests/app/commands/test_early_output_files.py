@@ -43,9 +43,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_folder_that_takes_no_files(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_that_takes_no_files(name, tmp_path, monkeypatch, capsys):
     plain, results = os.open, str(tmp_path / "results")
 
     def read_only(path: Any, flags: int, *options: Any, **more: Any) -> int:

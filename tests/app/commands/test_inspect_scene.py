@@ -93,9 +93,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
-def test_inspect_shows_what_a_scene_holds_and_draws_its_check(
-    box: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inspect_shows_what_a_scene_holds_and_draws_its_check(box, tmp_path, capsys):
     out = tmp_path / "out"
     assert cli.main(["inspect", str(box), f"out={out}"]) == 0
     printed = said(capsys)
@@ -119,9 +117,7 @@ def test_inspect_shows_what_a_scene_holds_and_draws_its_check(
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_repair_writes_a_scene_without_the_fault_that_inspect_names(
-    box: Path, arc: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], fault: str
-) -> None:
+def test_repair_writes_a_scene_without_the_fault_that_inspect_names(box, arc, tmp_path, capsys, fault):
     change, message, views = FAULTS[fault]
     scene = changed(arc if fault == "two exchanged" else box, tmp_path / "wrong", change)
     outside = "data.allow_outside=true"
@@ -141,9 +137,7 @@ def test_repair_writes_a_scene_without_the_fault_that_inspect_names(
     ]
 
 
-def test_repair_of_a_scene_without_faults_writes_nothing(
-    box: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_repair_of_a_scene_without_faults_writes_nothing(box, tmp_path, capsys):
     out = tmp_path / "repaired.json"
     assert cli.main(["repair", str(box), f"out={out}"]) == 2
     assert "nothing wrong was seen, so there is nothing to repair" in capsys.readouterr().err
@@ -152,9 +146,7 @@ def test_repair_of_a_scene_without_faults_writes_nothing(
     assert "give a name in .json" in capsys.readouterr().err
 
 
-def test_photographs_and_depth_of_two_cameras_are_registered_by_repair(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_photographs_and_depth_of_two_cameras_are_registered_by_repair(tmp_path, capsys):
     cameras, beside = few_cameras(8), few_cameras(8, 0.9 * 112)
     poses = beside.cam_from_world.copy()
     poses[:, 0, 3] += 0.03
@@ -167,14 +159,12 @@ def test_photographs_and_depth_of_two_cameras_are_registered_by_repair(
     assert "not registered in the files: f = 112 (photographs 100" in printed
     assert "nothing wrong was seen" in printed
     views = load_scene(repaired).views
-    assert views is not None
     np.testing.assert_allclose(views.cameras.Ks[:, 0, 0], 0.9 * 112, rtol=0.005)
     np.testing.assert_allclose(views.cameras.centers, replace(beside, cam_from_world=poses).centers, atol=0.004)
 
 
 def test_posed_images_that_are_written_are_read_back(box: Path) -> None:
     posed = read_posed(box)[0]
-    assert posed is not None
     models = [
         CameraModel(model="SIMPLE_RADIAL", width=160, height=120, params=(100.0, 80.0, 60.0, 0.01)),
         CameraModel(model="RADIAL", width=160, height=120, params=(100.0, 80.0, 60.0, 0.01, -0.02)),
@@ -221,9 +211,7 @@ def test_posed_images_that_are_written_are_read_back(box: Path) -> None:
             np.testing.assert_array_equal(after.depth_from_color, before.depth_from_color)
 
 
-def test_inspect_of_a_folder_shows_each_scene_and_a_splat_beside_none(
-    box: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inspect_of_a_folder_shows_each_scene_and_a_splat_beside_none(box, tmp_path, capsys):
     for name in ("one", "two"):
         changed(box, tmp_path / name, lambda content: None)
     assert cli.main(["inspect", str(tmp_path), "check=false", "data.allow_outside=true"]) == 0

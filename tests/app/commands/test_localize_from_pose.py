@@ -31,7 +31,6 @@ def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def world_pose(features: Path, view: int) -> np.ndarray:
     """cam_from_world of a view in world coordinates."""
     scene = load_features(features)
-    assert scene.views is not None
     pose = scene.views.cameras.cam_from_world[view].astype(np.float64)
     pose[:3, 3] -= pose[:3, :3] @ scene.origin
     return pose
@@ -74,9 +73,7 @@ def test_words_are_found_from_the_poses_of_a_file_and_from_views_of_the_scene(fe
         assert not np.array_equal(left, right)
 
 
-def test_without_the_options_nothing_is_added_and_without_pictures_none_is_drawn(
-    features: Path, tmp_path: Path
-) -> None:
+def test_without_the_options_nothing_is_added_and_without_pictures_none_is_drawn(features, tmp_path):
     plain, asked = tmp_path / "plain", tmp_path / "asked"
     common = ["localize", str(features), "query=cube", "pictures=0", "quiet=true"]
     assert cli.main([*common, f"out={plain}"]) == 0
@@ -112,9 +109,7 @@ def test_memories_are_asked_by_their_queries(features: Path, tmp_path: Path) -> 
     assert (out / "pose000_00_cube.png").is_file()
 
 
-def test_what_cannot_be_asked_is_refused_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_asked_is_refused_in_one_line(features, tmp_path, capsys):
     def refused(*words: str) -> str:
         out = tmp_path / "out"
         message = refusal(capsys, "localize", str(features), "query=cube", f"out={out}", *words)

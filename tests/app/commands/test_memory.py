@@ -103,9 +103,7 @@ def test_localize_views_and_pack_take_a_memory_as_features(made: Path, tmp_path:
     np.testing.assert_array_equal(index.seen, features.seen)
 
 
-def test_objects_are_boxed_from_a_memory_as_from_fused_features(
-    room: Path, made: Path, teachers: list[str], tmp_path: Path
-) -> None:
+def test_objects_are_boxed_from_a_memory_as_from_fused_features(room, made, teachers, tmp_path):
     words = room.parent / "words.safetensors"
     fuse = ["fuse", str(room), "teacher=labels", f"teacher.words={words}", f"out={tmp_path / 'fused'}", "quiet=true"]
     assert cli.main(fuse) == 0
@@ -122,13 +120,7 @@ def test_objects_are_boxed_from_a_memory_as_from_fused_features(
         np.testing.assert_allclose(boxes[1][word]["center"], box["center"], atol=0.05)
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(
-    room: Path,
-    teachers: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_interrupted_run_goes_on_where_it_stopped(room, teachers, tmp_path, monkeypatch, capsys):
     run = training.Trainer.run
 
     def stop_at_ten(self: training.Trainer, track: object) -> None:
@@ -161,9 +153,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
         np.testing.assert_array_equal(one.queries, other.queries)
 
 
-def test_teachers_can_be_optimized_one_by_one_or_not_at_all(
-    room: Path, teachers: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_teachers_can_be_optimized_one_by_one_or_not_at_all(room, teachers, tmp_path, monkeypatch):
     # Without pictures no raw features are kept.
     monkeypatch.setattr("gsencoder.train.memory.draw_sample", unused)
     fits = {}
@@ -211,9 +201,7 @@ def test_a_bare_splat_is_drawn_by_its_renders(tmp_path: Path) -> None:
     ]
 
 
-def test_a_run_whose_pictures_cannot_be_drawn_says_how_to_go_on(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_whose_pictures_cannot_be_drawn_says_how_to_go_on(room, tmp_path, capsys, monkeypatch):
     def damaged(*arguments: object, **settings: object) -> None:
         raise InputError("000.png: cannot be decoded")
 
@@ -226,9 +214,7 @@ def test_a_run_whose_pictures_cannot_be_drawn_says_how_to_go_on(
     assert (tmp_path / "out" / "memory.safetensors").is_file()
 
 
-def test_settings_and_scenes_that_cannot_be_are_refused_in_one_line(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_settings_and_scenes_that_cannot_be_are_refused_in_one_line(room, tmp_path, capsys, monkeypatch):
     out = f"out={tmp_path / 'out'}"
     palette = ["memory", str(room), "teacher=palette", out]
     for words, message in (
@@ -258,9 +244,7 @@ def test_banks_of_as_many_components_have_fingerprints_of_their_own() -> None:
     assert fingerprint_of(bank) == fingerprint_of(replace(bank)) != fingerprint_of(other)
 
 
-def test_settings_that_a_form_or_a_memory_does_not_take_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_that_a_form_or_a_memory_does_not_take_are_refused(tmp_path, capsys):
     memory = make_memory(gaussians=20)
     scene = Scene(name="s", gaussians=random_gaussians(20), origin=np.zeros(3))
     save_memories(tmp_path, scene, {"a": memory})

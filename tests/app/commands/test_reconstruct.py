@@ -49,9 +49,7 @@ def test_a_splat_is_refined(room: Path, built: Path, tmp_path: Path) -> None:
     assert results["psnr"] > summary_of(built)["results"]["psnr"]
 
 
-def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(
-    room: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(room, built, tmp_path, monkeypatch):
     out = tmp_path / "out"
     advance = reconstruct.Optimizer.advance
 
@@ -83,9 +81,7 @@ def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(
     assert (out / "splat.ply").is_file()
 
 
-def test_photographs_alone_are_placed_or_refused_in_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], room: Path
-) -> None:
+def test_photographs_alone_are_placed_or_refused_in_words(tmp_path, capsys, room):
     alone = tmp_path / "alone"
     alone.mkdir()
     assert "neither a scene nor a folder of scenes" in refusal(capsys, str(alone))
@@ -101,9 +97,7 @@ def test_photographs_alone_are_placed_or_refused_in_words(
     assert not (tmp_path / "out").exists()
 
 
-def test_photographs_alone_are_placed_once_and_become_a_splat(
-    tmp_path: Path, ten: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_photographs_alone_are_placed_once_and_become_a_splat(tmp_path, ten, monkeypatch, capsys):
     folder, out = shutil.copytree(ten, tmp_path / "photographs"), tmp_path / "out"
     words = [str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25", "dense.spacing=3"]
     words += ["sfm.size=400", "sfm.features=2000"]
@@ -142,9 +136,7 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(
     )
 
 
-def test_photographs_that_cannot_be_placed_are_told_before_any_is(
-    ten: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_that_cannot_be_placed_are_told_before_any_is(ten, tmp_path, capsys, monkeypatch):
     words = [str(tmp_path), f"out={tmp_path / 'out'}"]
     monkeypatch.setattr("gsencoder.reconstruct.sfm._find_features", never)
     for path in sorted(ten.iterdir())[:4]:
@@ -163,9 +155,7 @@ def test_photographs_that_cannot_be_placed_are_told_before_any_is(
     assert "has bytes that are no text" in refusal(capsys, *words)
 
 
-def test_films_beside_photographs_are_named(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_films_beside_photographs_are_named(room, tmp_path, capsys, monkeypatch):
     for path in sorted((room / "images").iterdir())[:3]:
         shutil.copy(path, tmp_path)
     (tmp_path / "film.MP4").write_bytes(b"")
@@ -174,9 +164,7 @@ def test_films_beside_photographs_are_named(
     assert "1 files are in formats that cannot be placed and are not used: film.MP4" in capsys.readouterr().err
 
 
-def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(room, tmp_path, monkeypatch, capsys):
     scene, out = shutil.copytree(room, tmp_path / "scene"), tmp_path / "out"
     words = [str(scene), f"out={out}", *QUICK]
     with monkeypatch.context() as patched:
@@ -207,9 +195,7 @@ def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(
         (["splat=nothing.ply"], "nothing.ply"),
     ],
 )
-def test_what_cannot_be_is_told(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], problem: str
-) -> None:
+def test_what_cannot_be_is_told(room, tmp_path, capsys, words, problem):
     assert problem in refusal(capsys, str(room), f"out={tmp_path / 'out'}", *words)
     assert not (tmp_path / "out").exists()
 

@@ -56,8 +56,6 @@ def test_the_results_of_a_video_are_a_scene_by_themselves(built: Path) -> None:
     results = summary_of(built)["results"]
     assert results["placed"] >= 14
     scene = load_scene(built, splat="splat.ply")
-    assert scene.views is not None
-    assert scene.views.images is not None
     assert len(scene.views) == results["placed"]
     assert len(list((built / "images").glob("*.jpg"))) == results["placed"] + len(results["missing"])
     assert scene.views.images[0].shape == (240, 320, 3)
@@ -70,7 +68,6 @@ def test_the_results_of_a_video_are_a_scene_by_themselves(built: Path) -> None:
 
 def test_cameras_of_a_video_stand_where_they_stood(built: Path) -> None:
     scene = load_scene(built, splat="splat.ply")
-    assert scene.views is not None
     numbers = [int(name[6:12]) for name in scene.views.names]
     centers, truth = scene.views.cameras.centers, box_cameras(FRAMES).centers[numbers]
     centers, truth = centers - centers.mean(0), truth - truth.mean(0)
@@ -82,9 +79,7 @@ def test_cameras_of_a_video_stand_where_they_stood(built: Path) -> None:
     assert np.median(errors) < 0.03 * np.linalg.norm(truth, axis=1).mean()
 
 
-def test_a_run_that_was_cut_off_takes_up_its_frames_and_poses(
-    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_was_cut_off_takes_up_its_frames_and_poses(video, tmp_path, monkeypatch):
     advance, out = reconstruct.Optimizer.advance, tmp_path / "walk"
 
     def stop_at_three(self: reconstruct.Optimizer) -> dict[str, float]:
@@ -108,9 +103,7 @@ def test_a_run_that_was_cut_off_takes_up_its_frames_and_poses(
     assert not out.with_name("walk.reconstruction").exists()
 
 
-def test_videos_of_a_folder_are_scenes_of_their_own_and_one_that_is_damaged_stops_no_other(
-    folder_run: tuple[Path, int, str],
-) -> None:
+def test_videos_of_a_folder_are_scenes_of_their_own_and_one_that_is_damaged_stops_no_other(folder_run):
     out, code, output = folder_run
     assert code == 2
     assert (out / "walk" / "splat.ply").is_file()
@@ -120,9 +113,7 @@ def test_videos_of_a_folder_are_scenes_of_their_own_and_one_that_is_damaged_stop
 
 
 @pytest.mark.parametrize("command", ["inspect", "fuse"])
-def test_other_commands_say_what_makes_a_scene_of_a_video(
-    video: Path, command: str, capfd: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_other_commands_say_what_makes_a_scene_of_a_video(video, command, capfd, tmp_path):
     words = [] if command == "inspect" else [f"out={tmp_path / 'out'}", "teacher=palette"]
     assert cli.main([command, str(video), *words]) == 2
     assert "walk.mp4: is a video; gsencoder reconstruct makes a scene of it" in capfd.readouterr().err

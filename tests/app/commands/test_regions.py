@@ -27,7 +27,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_room(made, folder)
     write_words(folder / "words.safetensors", made)
     views = load_scene(folder).views
-    assert views is not None
     assert views.instances is not None
     for name, labels in zip(views.names, views.instances, strict=True):
         (folder / "masks").mkdir(exist_ok=True)
@@ -84,14 +83,7 @@ def test_scenes_are_prepared_for_training_from_regions(room: Path, tmp_path: Pat
         (["teacher.vector=map", "teacher.folder=masks"], "teacher.model= is missing: the image tower of vector=map"),
     ],
 )
-def test_what_is_wrong_is_one_line(
-    room: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    options: list[str],
-    problem: str,
-) -> None:
+def test_what_is_wrong_is_one_line(room, tmp_path, capsys, monkeypatch, options, problem):
     monkeypatch.setenv("GSENCODER_MODELS", str(room))
     assert cli.main(["fuse", str(room), "teacher=regions", *options, f"out={tmp_path / 'o'}", "quiet=true"]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]

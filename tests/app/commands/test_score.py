@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 from command_runs import refusal, results_of
-from forked_ranks import RankServer
 from named_rooms import write_words
 
 from gsencoder.app import main as cli
@@ -73,9 +72,7 @@ def scored(protocol: str, evaluated: Path, out: Path, *options: str) -> dict[str
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_the_files_and_pages_that_evaluate_writes_have_the_scores_that_it_reports(
-    protocol: str, evaluated: dict[str, Path], tmp_path: Path
-) -> None:
+def test_the_files_and_pages_that_evaluate_writes_have_the_scores_that_it_reports(protocol, evaluated, tmp_path):
     out = tmp_path / "score"
     again = scored(protocol, evaluated[protocol], out, *as_evaluated(protocol, evaluated), "report=true")
     first = results_of(evaluated[protocol])
@@ -106,9 +103,7 @@ def test_features_that_were_fused_from_the_labels_name_nearly_all_that_is_there(
 
 
 @pytest.mark.parametrize(("protocol", "count"), [("instances", 3)])
-def test_processes_that_share_the_scenes_score_each_of_them_once(
-    protocol: str, count: int, rooms: Path, evaluated: dict[str, Path], tmp_path: Path, ranks: RankServer
-) -> None:
+def test_processes_that_share_the_scenes_score_each_of_them_once(protocol, count, rooms, evaluated, tmp_path, ranks):
     scenes = [str(rooms / f"room_{number}") for number in range(2)]
     options = [f"protocol={protocol}", f"teacher.words={rooms / 'words.safetensors'}", *PROTOCOLS[protocol]]
     words = ["evaluate", *scenes, *options, f"out={tmp_path / 'out'}", "quiet=true"]
@@ -128,8 +123,6 @@ def test_processes_that_share_the_scenes_score_each_of_them_once(
         (["semantics", "classes=scannet20", "java=false"], "java: semantics has no such setting"),
     ],
 )
-def test_settings_that_do_not_fit_the_protocol_are_refused(
-    words: list[str], message: str, evaluated: dict[str, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_that_do_not_fit_the_protocol_are_refused(words, message, evaluated, capsys):
     folder = evaluated["instances"]
     assert message in refusal(capsys, "score", *words, f"predictions={folder / 'predictions'}", f"truth={folder}/truth")

@@ -53,9 +53,7 @@ def test_masks_of_classes_that_are_not_scored_are_counted(tmp_path: Path) -> Non
     assert "Not counted: 1 mask with a class id that is none of the 2" in (tmp_path / "out/table.md").read_text()
 
 
-def test_labels_of_no_class_are_refused_in_truth_and_counted_in_predictions(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_labels_of_no_class_are_refused_in_truth_and_counted_in_predictions(tmp_path, capsys):
     for name in ("truth", "predictions"):
         (tmp_path / name).mkdir()
     (tmp_path / "classes.csv").write_text(CLASSES)
@@ -80,9 +78,7 @@ def test_lists_without_an_entry_are_refused(protocol: str, tmp_path: Path, capsy
     assert "truth.json" in message
 
 
-def test_a_mask_that_is_a_link_to_itself_and_a_pipe_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mask_that_is_a_link_to_itself_and_a_pipe_are_refused(tmp_path, capsys):
     truth = blocks(1001, 0)
     words = [*instance_files(tmp_path, truth, [(truth == 1001, 1, 0.9)]), f"classes={tmp_path / 'classes.csv'}"]
     mask = tmp_path / "predictions/masks/0.txt"
@@ -94,9 +90,7 @@ def test_a_mask_that_is_a_link_to_itself_and_a_pipe_are_refused(
     assert "is not a regular file" in refusal(capsys, *words)
 
 
-def test_scenes_without_captions_are_refused_or_count_as_empty(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_scenes_without_captions_are_refused_or_count_as_empty(tmp_path, capsys):
     corners = [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]
     entry: dict[str, Any] = {"object_id": "0", "object_name": "mug", "ann_id": "0", "bbox": corners}
     words = {"description": "a red mug", "token": ["a", "red", "mug"]}

@@ -32,9 +32,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("protocol", ["semantics", "instances"])
-def test_scans_and_the_files_that_evaluate_writes_have_one_truth(
-    protocol: str, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scans_and_the_files_that_evaluate_writes_have_one_truth(protocol, home, tmp_path, monkeypatch):
     monkeypatch.setattr("gsencoder.evaluate.benchmarks.instances.MIN_REGION", 20)
     lists = [f"classes={home / 'top100.txt'}", f"label_map={home / 'map_benchmark.csv'}"]
     words = f"teacher.words={home / 'words.safetensors'}"
@@ -57,9 +55,7 @@ def test_scans_and_the_files_that_evaluate_writes_have_one_truth(
         assert {-100, 0} <= labels
 
 
-def test_instances_of_a_class_with_the_id_0_are_refused(
-    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_instances_of_a_class_with_the_id_0_are_refused(home, tmp_path, capsys):
     (tmp_path / "classes.csv").write_text("id,name\n0,ball\n1,cube\n")
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()

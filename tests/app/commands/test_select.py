@@ -44,7 +44,6 @@ def test_objects_and_rest_are_the_whole_scene(features: Path, tmp_path: Path) ->
         "book.ply", "holes.json", "labels.json", "labels.ply", "mug.ply", "rest.ply", "summary.json",
     ]  # fmt: skip
     labeled = read_labels(out)
-    assert SCENE.gaussians is not None
     for label, name in enumerate(("rest", "mug", "book")):
         part = load_splat(out / f"{name}.ply", origin=SCENE.origin)
         rows = labeled.labels == label
@@ -62,9 +61,7 @@ def test_objects_and_rest_are_the_whole_scene(features: Path, tmp_path: Path) ->
     assert holes["pixels"] == sum(hole["pixels"] for hole in holes["by_view"])
 
 
-def test_the_parts_that_are_asked_for_are_written(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_parts_that_are_asked_for_are_written(features, tmp_path, capsys, monkeypatch):
     run(features, tmp_path / "a", "query=mug", "write=objects", "format=spz")
     assert names_in(tmp_path / "a") == ["mug.spz", "summary.json"]
     run(features, tmp_path / "b", "query=mug", "write=rest", "format=compressed.ply", "select.views=0")
@@ -109,9 +106,7 @@ def test_packages_and_memories_are_selected_from_like_features(features: Path, t
         assert ((read_labels(out).labels == 1) == (KINDS == 0)).mean() > 0.98
 
 
-def test_a_bare_splat_is_selected_from_with_a_warning(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bare_splat_is_selected_from_with_a_warning(tmp_path, capsys, monkeypatch):
     bare = tmp_path / "bare"
     save_features(bare, replace(SCENE, views=None), SCENE.features["names"], {})
     save_text_table(bare / WORDS_FILE, words())
@@ -147,9 +142,7 @@ def test_names_of_objects_lead_to_safe_names_of_files(tmp_path: Path) -> None:
         (["query=mug", "write=[]"], "write"),
     ],
 )
-def test_what_cannot_be_done_ends_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
+def test_what_cannot_be_done_ends_in_one_line(features, tmp_path, capsys, arguments, message):
     out = tmp_path / "out"
     assert message in refusal(capsys, "select", str(features), f"out={out}", *arguments)
     assert not out.exists()

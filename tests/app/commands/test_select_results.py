@@ -34,9 +34,7 @@ def run(*arguments: str | Path) -> None:
     assert cli.main(["select", *map(str, arguments)]) == 0
 
 
-def test_seeds_and_labels_are_counted_for_each_word(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_seeds_and_labels_are_counted_for_each_word(features, tmp_path, capsys):
     run(features, "query=mug,book", "threshold=0.9", f"out={tmp_path / 'out'}", "write=[objects,labels]")
     output = capsys.readouterr().out
     expected, _ = select(SCENE, ("mug", "book"), words(), threshold=0.9)
@@ -50,7 +48,6 @@ def test_seeds_and_labels_are_counted_for_each_word(
     for name, seed, count in zip(("mug", "book"), seeds, counts, strict=True):
         assert f"{name}: {count:,} Gaussians, from {seed:,} to start with, {name}.ply" in output
     part = load_splat(tmp_path / "out" / "mug.ply", origin=SCENE.origin)
-    assert SCENE.gaussians is not None
     np.testing.assert_allclose(part.means, SCENE.gaussians.means[expected.labels == 1], atol=1e-4)
 
 
@@ -66,16 +63,13 @@ def test_words_with_the_names_of_the_commands_files_get_other_files(tmp_path: Pa
 
 
 @pytest.mark.parametrize("under", [True, False])
-def test_holes_are_those_of_the_objects_in_each_view(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], under: bool
-) -> None:
+def test_holes_are_those_of_the_objects_in_each_view(tmp_path, capsys, under):
     scene, _ = selected_room(under=under)
     folder = stored(tmp_path / "features", scene)
     run(folder, "query=mug", f"out={tmp_path / 'out'}")
     output = " ".join(capsys.readouterr().out.split())
     made = json.loads((tmp_path / "out" / "holes.json").read_text())
     assert scene.gaussians is not None
-    assert scene.views is not None
     selection, _ = select(scene, ("mug",), words())
     cameras = scene.views.cameras
     holes = find_holes(scene.gaussians, cameras, selection.labels > 0, sample_views(cameras, 48))
@@ -93,9 +87,7 @@ def test_holes_are_those_of_the_objects_in_each_view(
     assert f"nothing is behind {pixels / removed:.0%} of the removed pixels in {len(holes)} views" in output
 
 
-def test_a_box_that_is_asked_for_and_settings_of_boxes_reach_the_selection(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_box_that_is_asked_for_and_settings_of_boxes_reach_the_selection(features, tmp_path, capsys):
     scene_features = SCENE.features["names"]
     vectors = scene_features.features.copy()
     vectors[KINDS == 1] = 0.8 * EMBEDDINGS[0] + 0.2 * EMBEDDINGS[2]
@@ -107,9 +99,7 @@ def test_a_box_that_is_asked_for_and_settings_of_boxes_reach_the_selection(
     assert "siglip" in refusal(capsys, *common, "head=siglip")
 
 
-def test_words_are_printed_on_one_line_in_their_own_direction(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_words_are_printed_on_one_line_in_their_own_direction(tmp_path, capsys):
     word = "\u202egum"
     folder = stored(tmp_path / "features", table=make_text_table((word, "book", "table", "lamp"), EMBEDDINGS, "table"))
     run(folder, f"query={word}", f"out={tmp_path / 'out'}", "write=objects")

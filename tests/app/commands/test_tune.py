@@ -71,9 +71,7 @@ def words(given: Path, out: Path, *more: str, dataset: Path | None = None) -> li
     return ["tune", str(dataset or given / "ScanQA_v1.0_train.json"), *defaults, *more]
 
 
-def test_adapters_a_log_and_figures_are_written_and_prompts_are_kept(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_adapters_a_log_and_figures_are_written_and_prompts_are_kept(given, tmp_path, capsys):
     out = tmp_path / "out"
     assert cli.main(words(given, out, "train.log_every=3", "quiet=false")) == 0
     assert "in the log's only row (train.log_every=3)" in " ".join(capsys.readouterr().out.split())
@@ -109,9 +107,7 @@ def test_prompts_are_those_that_ask_sends(given: Path, tmp_path: Path) -> None:
     assert len(sent) == 2
 
 
-def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(
-    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(given, tmp_path, monkeypatch):
     from gsencoder.app.commands import tune as tuning_prompts
 
     made: list[str] = []
@@ -133,9 +129,7 @@ def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(
     assert len(made) == 7
 
 
-def test_an_interrupted_command_goes_on_as_if_nothing_had_happened(
-    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupts: None
-) -> None:
+def test_an_interrupted_command_goes_on_as_if_nothing_had_happened(given, tmp_path, monkeypatch, interrupts):
     from gsencoder.train.loop import TrainerConfig
 
     assert cli.main(words(given, tmp_path / "whole", "train.steps=6")) == 0
@@ -223,9 +217,7 @@ def test_bad_input_is_refused_in_a_line(given: Path, tmp_path: Path, capsys: pyt
     assert not (tmp_path / "out").exists()
 
 
-def test_layers_that_the_model_does_not_have_are_refused_before_prompts_are_prepared(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_layers_that_the_model_does_not_have_are_refused_before_prompts_are_prepared(given, tmp_path, capsys):
     arguments = words(given, tmp_path / "out", "lora.targets=[q_proj,fc9]")
     line = refusal(capsys, *(word for word in arguments if word != "quiet=true"))
     assert "lora.targets: no linear layer outside the vision tower is called fc9; there are " in line

@@ -73,15 +73,11 @@ def test_two_folders_are_two_scenes_of_one_page(folder: Path, built: Path, tmp_p
         (["space=other"], "none of 'other'"),
     ],
 )
-def test_wrong_options_are_refused_in_one_line(
-    folder: Path, built: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_options_are_refused_in_one_line(folder, built, options, message, capsys):
     assert message in refusal(capsys, "view", str(folder / "features"), *options)
 
 
-def test_a_page_that_was_not_built_is_refused_in_one_line(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_page_that_was_not_built_is_refused_in_one_line(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bundle, "STATIC", tmp_path / "nowhere")
     assert "make viewer" in refusal(capsys, "view", str(folder / "features"))
 
@@ -101,9 +97,7 @@ sys.exit(cli.main(["view", sys.argv[2], "open=false"]))
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
-def test_the_server_answers_until_it_is_stopped_and_then_says_how_it_ended(
-    folder: Path, built: Path, number: signal.Signals, code: int
-) -> None:
+def test_the_server_answers_until_it_is_stopped_and_then_says_how_it_ended(folder, built, number, code):
     # The address comes at once even where Python collects what is printed into a pipe.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     command = [sys.executable, "-c", SERVE, str(built), str(folder / "features")]
@@ -116,7 +110,6 @@ def test_the_server_answers_until_it_is_stopped_and_then_says_how_it_ended(
         # A background job of a shell begins with the signal ignored.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
-        assert process.stdout is not None
         line = process.stdout.readline()
         address = re.match(r"http://127\.0\.0\.1:\d+/[\w-]{32}/", line)
         assert address is not None, line
@@ -128,9 +121,7 @@ def test_the_server_answers_until_it_is_stopped_and_then_says_how_it_ended(
     assert "Traceback" not in errors
 
 
-def test_folders_of_two_scenes_are_not_shown_side_by_side(
-    folder: Path, built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folders_of_two_scenes_are_not_shown_side_by_side(folder, built, tmp_path, capsys, monkeypatch):
     features, other = folder / "features", tmp_path / "other"
     copytree(features, other)
     load = view.load_features

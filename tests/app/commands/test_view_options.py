@@ -55,9 +55,7 @@ def test_photographs_and_labeled_objects_come_from_the_scene_that_was_fused(fold
     assert scene.meta["photographs"] is False
 
 
-def test_options_of_features_boxes_and_words_reach_the_page(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_of_features_boxes_and_words_reach_the_page(folder, tmp_path, capsys):
     features = folder / "features"
     limit = ("localize.threshold.kind=fixed", "localize.threshold.fixed=0.9")
     (scene,), results = written(tmp_path / "a.html", features, *limit, "megabytes=1")
@@ -70,9 +68,7 @@ def test_options_of_features_boxes_and_words_reach_the_page(
     assert not (tmp_path / "b.html").exists()
 
 
-def test_harmonics_stay_and_the_last_line_names_their_degree(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_harmonics_stay_and_the_last_line_names_their_degree(tmp_path, capsys):
     for name, degree in (("plain", 0), ("rich", 3)):
         (tmp_path / name).mkdir()
         assert ROOM.gaussians is not None
@@ -88,9 +84,7 @@ def test_harmonics_stay_and_the_last_line_names_their_degree(
     assert [scene.meta["title"] for scene in scenes] == [str(each) for each in folders]
 
 
-def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(folder, tmp_path, capsys):
     features, _ = name_features(ROOM)
     dense = replace(features, space=replace(features.space, name="dense", text_encoder=""))
     (tmp_path / "dense").mkdir()
@@ -135,9 +129,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return seen
 
 
-def test_the_server_gets_the_scene_as_it_is_to_be_searched(
-    folder: Path, served: SimpleNamespace, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_server_gets_the_scene_as_it_is_to_be_searched(folder, served, capsys):
     arguments = ["max_gaussians=1500", "localize.min_probability=0.1", "port=4321"]
     assert cli.main(["view", str(folder / "features"), f"photos={folder / 'room'}", *arguments]) == 0
     assert served.options == {"port": 4321}
@@ -156,14 +148,7 @@ def test_the_server_gets_the_scene_as_it_is_to_be_searched(
     ("option", "terminal", "opens"),
     [(None, True, True), (None, False, False), ("open=true", False, True), ("open=false", True, False)],
 )
-def test_a_browser_is_opened_when_told_or_at_a_terminal(
-    folder: Path,
-    served: SimpleNamespace,
-    monkeypatch: pytest.MonkeyPatch,
-    option: str | None,
-    terminal: bool,
-    opens: bool,
-) -> None:
+def test_a_browser_is_opened_when_told_or_at_a_terminal(folder, served, monkeypatch, option, terminal, opens):
     monkeypatch.setattr(view.sys.stdout, "isatty", lambda: terminal, raising=False)
     assert cli.main(["view", str(folder / "features"), "quiet=true", *([option] if option else [])]) == 0
     assert served.opened == (["http://127.0.0.1:1/token/"] if opens else [])

@@ -50,9 +50,7 @@ def test_views_are_written_with_what_they_show_and_why(features: Path, tmp_path:
     assert np.isfinite(tokens).all()
 
 
-def test_a_word_that_is_absent_is_said_to_be(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_word_that_is_absent_is_said_to_be(features, tmp_path, capsys):
     words = "query=cube,pen holder"
     loud = [word for word in QUICK if word != "quiet=true"]
     assert cli.main(["views", str(features), words, f"out={tmp_path / 'views'}", *loud]) == 0
@@ -103,9 +101,7 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
         (("query=cube", "photos=nowhere"), "nowhere: no such file or folder"),
     ],
 )
-def test_what_cannot_be_done_ends_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], problem: str
-) -> None:
+def test_what_cannot_be_done_ends_in_one_line(features, tmp_path, capsys, words, problem):
     assert cli.main(["views", str(features), *words, f"out={tmp_path / 'out'}"]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1

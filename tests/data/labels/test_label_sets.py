@@ -69,9 +69,7 @@ def test_raw_names_have_the_ids_of_each_benchmark(tmp_path: Path) -> None:
         ((), "id", "maps no name"),
     ],
 )
-def test_a_wrong_label_map_is_refused_with_its_line(
-    tmp_path: Path, rows: tuple[str, ...], column: str, problem: str
-) -> None:
+def test_a_wrong_label_map_is_refused_with_its_line(tmp_path, rows, column, problem):
     path = write_map(tmp_path / "map.tsv", *rows)
     with pytest.raises(InputError, match=problem) as error:
         read_label_map(path, column)

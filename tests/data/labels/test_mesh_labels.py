@@ -146,9 +146,7 @@ def error_of(folder: Path) -> str:
         ({"faces": np.array([[0, 1, 2], [3, 4, 6]])}, "mesh", "face 1 names vertex 6 of 6"),
     ],
 )
-def test_a_wrong_entry_is_one_line_that_names_file_and_entry(
-    tmp_path: Path, changes: dict[str, Any], file: str, problem: str
-) -> None:
+def test_a_wrong_entry_is_one_line_that_names_file_and_entry(tmp_path, changes, file, problem):
     folder = scan(tmp_path, **changes)
     message = error_of(folder)
     assert message.startswith(str(folder / f"{NAME}{SUFFIXES[file]}"))
@@ -263,9 +261,7 @@ def test_objects_of_scannetpp_count_from_one(tmp_path: Path) -> None:
         ({"faces": np.array([[0, 1, 2]], np.int32)}, "faces: expected rows of 2 vertices"),
     ],
 )
-def test_labels_that_contradict_each_other_are_refused(
-    no_jaxtyping: None, changes: dict[str, Any], message: str
-) -> None:
+def test_labels_that_contradict_each_other_are_refused(no_jaxtyping, changes, message):
     parts = {"vertices": np.zeros((2, 3), np.float32), "instances": np.zeros(2, np.int32), "objects": ((1, "a"),)}
     with pytest.raises(InputError, match=message):
         MeshLabels(**(parts | changes))

@@ -130,8 +130,6 @@ def test_a_wrong_entry_of_scanqa_is_named(tmp_path: Path, content: Any, message:
         ([question(1, situation="")], [annotation(1)], r"questions\[0\]: situation is empty"),
     ],
 )
-def test_files_of_sqa3d_must_belong_together(
-    tmp_path: Path, questions: list[Any], annotations: list[Any] | None, message: str
-) -> None:
+def test_files_of_sqa3d_must_belong_together(tmp_path, questions, annotations, message):
     with pytest.raises(InputError, match=message):
         read_questions(sqa3d(tmp_path, questions, annotations))

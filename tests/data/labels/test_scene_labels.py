@@ -119,9 +119,7 @@ def source_of_maps(folder: Path) -> str:
     return str(scene_facts(load_scene(folder), posed, layout, None)["instances"])
 
 
-def test_archives_of_instances_come_before_maps_of_the_mesh_and_the_filtered_one_first(
-    room: Scene, tmp_path: Path
-) -> None:
+def test_archives_of_instances_come_before_maps_of_the_mesh_and_the_filtered_one_first(room, tmp_path):
     folder = write_scannet_scan(room, tmp_path / "scene0000_00")
     assert source_of_maps(folder) == "drawn from the labeled mesh"
     pack(folder / "scene0000_00_2d-instance.zip", "instance", [np.full((72, 96), 7)] * VIEWS)
@@ -149,9 +147,7 @@ def test_archives_of_instances_come_before_maps_of_the_mesh_and_the_filtered_one
         ([np.ones((36, 48))] * VIEWS, "has pictures of 48×36 pixels, and photographs have 96×72"),
     ],
 )
-def test_an_archive_that_does_not_fit_is_named_and_maps_are_drawn(
-    maps: list[np.ndarray], problem: str, room: Scene, tmp_path: Path
-) -> None:
+def test_an_archive_that_does_not_fit_is_named_and_maps_are_drawn(maps, problem, room, tmp_path):
     folder = write_scannet_scan(room, tmp_path / "scene0000_00")
     pack(folder / "scene0000_00_2d-instance-filt.zip", "instance-filt", maps)
     with pytest.warns(SceneWarning, match=f"{problem}, so that instance maps are drawn from the labeled mesh"):

@@ -130,9 +130,7 @@ def test_truth_and_prediction_of_a_scene_are_not_taken_for_each_other(tmp_path: 
     assert (files.prediction, files.labels) == (folders[0] / "s.txt", folders[1] / "s.txt")
 
 
-def test_of_many_scenes_those_asked_for_are_taken_by_name_and_three_are_named_where_one_is_foreign(
-    tmp_path: Path,
-) -> None:
+def test_of_many_scenes_those_asked_for_are_taken_by_name_and_three_are_named_where_one_is_foreign(tmp_path):
     predictions, truth = label_folders(tmp_path, predictions=[1], truth=[1])
     for name in ("e", "b", "d", "a"):
         for folder in (predictions, truth):

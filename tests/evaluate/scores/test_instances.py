@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Sequence
-from random import Random
 
 import numpy as np
 import pytest
@@ -283,9 +282,7 @@ def test_every_threshold_from_a_half_follows_the_definition(scene: tuple[np.ndar
 
 @settings(max_examples=25)
 @given(scenes(), st.randoms())
-def test_the_order_of_masks_means_nothing_where_none_lies_on_two_truths(
-    scene: tuple[np.ndarray, list[Mask]], random: Random
-) -> None:
+def test_the_order_of_masks_means_nothing_where_none_lies_on_two_truths(scene, random):
     truth, masks = scene
     shuffled = list(masks)
     random.shuffle(shuffled)
@@ -313,9 +310,7 @@ def test_the_order_of_vertices_means_nothing(scene: tuple[np.ndarray, list[Mask]
 
 @settings(max_examples=25)
 @given(st.lists(scenes(), min_size=2, max_size=4))
-def test_the_order_of_scenes_means_nothing_and_a_scene_without_anything_changes_nothing(
-    parts: list[tuple[np.ndarray, list[Mask]]],
-) -> None:
+def test_the_order_of_scenes_means_nothing_and_a_scene_without_anything_changes_nothing(parts):
     matches = [
         match_instances(truth, masks_of(*masks, scene=str(k)), CLASSES) for k, (truth, masks) in enumerate(parts)
     ]

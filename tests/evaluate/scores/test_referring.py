@@ -186,8 +186,6 @@ def test_the_best_of_more_boxes_is_no_worse_and_cells_add_up(rows: list[Row]) ->
         ([found(1, CUBE, scene="b")], [truth(1)], "object 1 of b is predicted, and not in the truth"),
     ],
 )
-def test_predictions_that_do_not_belong_to_the_truth_are_refused(
-    predictions: list[PredictedBoxes], sentences: list[Expression], message: str
-) -> None:
+def test_predictions_that_do_not_belong_to_the_truth_are_refused(predictions, sentences, message):
     with pytest.raises(InputError, match=message):
         compare_boxes(predictions, sentences, allow_missing=True)

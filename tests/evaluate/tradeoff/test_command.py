@@ -54,9 +54,7 @@ def data_of(page: Path) -> dict[str, Any]:
     return data
 
 
-def test_fusion_is_measured_against_the_exact_features(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fusion_is_measured_against_the_exact_features(scene, tmp_path, capsys):
     out = tmp_path / "out"
     sweep = ["sweep.knobs=min_weight,max_rank,views"]
     sweep += ["sweep.values=min_weight:0.2,max_rank:1,views:2", "halving.settings=8"]
@@ -110,9 +108,7 @@ def test_words_packages_and_views_have_scores_of_their_own(scene: Path, tmp_path
 
 
 @pytest.mark.parametrize("wrong", ["sweep.values=min_weight:2", "sweep.rounds=0", "stages=[]"])
-def test_what_is_out_of_range_is_refused(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: str
-) -> None:
+def test_what_is_out_of_range_is_refused(scene, tmp_path, capsys, wrong):
     words = [word for word in words_of(scene) if not word.startswith("sweep.")]
     assert cli.main([*words, wrong, f"out={tmp_path / 'out'}", "quiet=true"]) == 2
     line = capsys.readouterr().err
@@ -121,9 +117,7 @@ def test_what_is_out_of_range_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_stage_that_asks_for_words_needs_objects_that_have_names(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stage_that_asks_for_words_needs_objects_that_have_names(scene, tmp_path, capsys):
     words = words_of(scene, "stages=localization", "asked.min_pixels=100000", "quiet=true")
     assert cli.main([*words, f"out={tmp_path / 'out'}"]) == 2
     assert "scene room has no object to localize" in capsys.readouterr().err

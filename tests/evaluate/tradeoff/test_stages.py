@@ -33,9 +33,7 @@ def base() -> ReconstructionSettings:
     return replace(settings, reconstruct=replace(settings.reconstruct, optimize=quick, holdout=2))
 
 
-def test_scores_are_those_of_the_reconstruction_itself_in_the_size_that_is_judged(
-    folder: Path, base: ReconstructionSettings
-) -> None:
+def test_scores_are_those_of_the_reconstruction_itself_in_the_size_that_is_judged(folder, base):
     assert base.data == INPUTS.data
     with make_stage("reconstruction", INPUTS).open(folder) as (run, judge):
         product = run(base)
@@ -50,9 +48,7 @@ def test_scores_are_those_of_the_reconstruction_itself_in_the_size_that_is_judge
         assert judge(darker, base)[0]["psnr"].total < scores["psnr"].total - 2
 
 
-def test_photographs_that_are_fitted_smaller_are_judged_in_the_size_of_all_settings(
-    folder: Path, base: ReconstructionSettings, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_that_are_fitted_smaller_are_judged_in_the_size_of_all_settings(folder, base, monkeypatch):
     sizes = list[tuple[int, int]]()
     half = replace(base, data=SceneConfig(image_scale=0.4))
     at_scale = Photographs.at_scale

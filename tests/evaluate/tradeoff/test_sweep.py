@@ -180,9 +180,7 @@ def test_measurements_come_back_from_the_file_whatever_the_order_of_knobs(tmp_pa
 @pytest.mark.parametrize(
     ("number", "problem"), [(errno.ENOSPC, "no space left on the device"), (errno.EIO, "Input/output error")]
 )
-def test_a_measurement_that_cannot_be_written_ends_the_sweep(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, problem: str
-) -> None:
+def test_a_measurement_that_cannot_be_written_ends_the_sweep(tmp_path, monkeypatch, number, problem):
     def refused(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
