@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from gsencoder.app.commands.select import LABELS_JSON, LABELS_PLY, PROPERTY
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.splats.files import load_property, load_splat
-from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, PROPERTY
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
 

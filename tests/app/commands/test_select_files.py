@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from selected_rooms import read_labels, selected_room
 
+from gsencoder.app.commands.select import LABELS_JSON, LABELS_PLY, file_stems, write_labels
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_property, load_splat, save_splat
 from gsencoder.infer.draw import word_color
 from gsencoder.infer.select import Selection
-from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, file_stems, write_labels
 
 SCENE, KINDS = selected_room()
 LABELS = np.array([1, 2, 0], np.int32)[KINDS]
