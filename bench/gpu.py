@@ -293,7 +293,7 @@ def encoder_parity(setting: Setting) -> Iterator[Row]:
         for precision, most in (("float32", 1e-3), ("bfloat16", 1e-1)):
             dtype = autocast_dtype(precision, setting.device)  # type: ignore[arg-type]
             with torch.autocast(setting.device.type, dtype, enabled=dtype is not None):
-                got = network(*(each.to(setting.device) for each in inputs))
+                got = network(*to_device(inputs, setting.device))
             yield compared(precision, got, expected, most)
 
 

@@ -172,7 +172,7 @@ def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pyt
         (["teacher=[palette,labels]", words, "loss.teacher_weights=[1.0]"], "loss.teacher_weights: expected 2 numbers"),
         (["teacher=[palette,other:palette]"], "teachers: palette and other have the same features"),
         (["teacher=[palette,labels]", "teacher.words=x"], "teacher.words: is for a single teacher, and teachers="),
-        (["teachers=palette,labels", "teacher=radio"], "leave out teacher= or teachers="),
+        (["teachers=palette,labels", "teacher=radio"], "teacher: is for a single teacher"),
         (["teacher=[palette,x:onnx]"], "teachers.x.model= is missing"),
     ):
         assert message in refusal(capsys, *train, *more), more

@@ -61,7 +61,7 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights
     together = runtime.encode_spaces(cloud, ALONE)
     for name, features in together.items():
         np.testing.assert_array_equal(runtime.encode(cloud, ALONE, space=name).features, features.features)
-    with pytest.raises(InputError, match="gives features of labels, colors, raw; name one of them"):
+    with pytest.raises(InputError, match="there are features of labels, colors, raw; name one of them"):
         runtime.encode(cloud, ALONE)
     # A wrong block of columns in the graph is not hidden by the larger numbers of another space.
     wrong = OutputSpaces(by_teacher=outputs.by_teacher | {"colors": replace(second, scale=5.001)})

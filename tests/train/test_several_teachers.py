@@ -255,5 +255,5 @@ def test_two_teachers_of_one_feature_space_are_refused(datasets: Datasets) -> No
     other = replace(outputs, space=replace(outputs.space, preprocessing="half size"))
     both = OutputSpaces(by_teacher={"a": outputs, "b": other})
     assert both.resolve("b") == "b"
-    with pytest.raises(InputError, match="gives features of a, b; got 'sides'"):
+    with pytest.raises(InputError, match="there are features of a, b; got 'sides'"):
         both.resolve("sides")

@@ -250,7 +250,7 @@ def test_settings_that_a_form_or_a_memory_does_not_take_are_refused(tmp_path, ca
     save_memories(tmp_path, scene, {"a": memory})
     folder, out = str(tmp_path), f"out={tmp_path / 'm.onnx'}"
     export = ["export", f"memory={folder}", out]
-    assert "expected one of them, got 'foo'" in refusal(capsys, *export, "space=foo")
+    assert "there are features of s; got 'foo'" in refusal(capsys, *export, "space=foo")
     assert "splats are compared with encoders alone" in refusal(capsys, "export", "/nowhere", *export[1:])
     assert "space: names a teacher of memory=" in refusal(capsys, "export", "space=foo", out)
     packed = ["pack", folder, f"out={tmp_path / 'p'}"]

@@ -138,7 +138,7 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(tmp_path, ten, mon
 
 def test_photographs_that_cannot_be_placed_are_told_before_any_is(ten, tmp_path, capsys, monkeypatch):
     words = [str(tmp_path), f"out={tmp_path / 'out'}"]
-    monkeypatch.setattr("gsencoder.reconstruct.sfm._find_features", never)
+    monkeypatch.setattr("gsencoder.reconstruct.sfm._map", never)
     for path in sorted(ten.iterdir())[:4]:
         shutil.copy(path, tmp_path)
     assert "sfm.size: expected 64" in refusal(capsys, *words, "sfm.size=99999999999")

@@ -215,10 +215,3 @@ def test_bad_input_is_refused_in_a_line(given: Path, tmp_path: Path, capsys: pyt
     (tmp_path / "taken" / "thesis.tex").write_text("x")
     assert "holds something else" in refused(f"prepared={tmp_path / 'taken'}")
     assert not (tmp_path / "out").exists()
-
-
-def test_layers_that_the_model_does_not_have_are_refused_before_prompts_are_prepared(given, tmp_path, capsys):
-    arguments = words(given, tmp_path / "out", "lora.targets=[q_proj,fc9]")
-    line = refusal(capsys, *(word for word in arguments if word != "quiet=true"))
-    assert "lora.targets: no linear layer outside the vision tower is called fc9; there are " in line
-    assert list(tmp_path.iterdir()) == []
