@@ -143,7 +143,6 @@ class Choices:
     Attributes:
         members: for each key the members of a choice that have this option; empty if it always applies.
         groups: the names of each choice's members.
-        chosen: the default of each choice.
     """
 
     options: Mapping[str, Option]

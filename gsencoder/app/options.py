@@ -40,7 +40,6 @@ class Option:
 
     Attributes:
         key: its full name, with dots between sections.
-        annotation: its type.
         member: the member of a choice that it belongs to, such as "teacher=onnx"; empty if it always applies.
         metadata: of its field; see the head of this module.
     """

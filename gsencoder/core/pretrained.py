@@ -120,10 +120,8 @@ def load_pretrained(loader: Any, folder: Path, subject: str, *, ignored: Sequenc
     Args:
         loader: a class of transformers with `from_pretrained`.
         folder: with `config.json` and safetensors files.
-        subject: who loads it, for messages.
         ignored: prefixes of weights of modules that the class does not have, such as the other tower of a joint model,
             which need no warning.
-        options: further arguments of `from_pretrained`.
     """
     weight_files(folder, subject)
     with _readable(folder, subject):
@@ -141,11 +139,9 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, subject: str)
 
     Args:
         loader: a class of transformers with `from_pretrained`.
-        config: of the part.
         folder: with safetensors files.
         weight: name of one of the part's weights within the part; the rest of its name in the files is the prefix of
             the part.
-        subject: who loads it, for messages.
     """
     files = weight_names(folder, subject)
     prefixes = sorted(name.removesuffix(weight) for name in files if name.endswith(f".{weight}") or name == weight)

@@ -40,7 +40,6 @@ class Photographs:
 
     Attributes:
         cameras: of all views, at full size.
-        names: of all views.
         orientations: of all views, EXIF's; 1 = upright.
     """
 

@@ -38,7 +38,6 @@ class ClassAccuracy:
     Attributes:
         correct, total: for each row of the codebook, the Gaussians with this target: those that are classified
             correctly, and all.
-        scenes: that were added.
     """
 
     def __init__(self, space: OutputSpace, codebook: Float32[np.ndarray, "C channels"], *, pictured: int = 0) -> None:

@@ -131,8 +131,6 @@ class BudgetFusion:
 
     Attributes:
         fusion: the features, with as few coordinates as a limit of megabytes asks for.
-        choice: the number of views.
-        predicted: by limit.
         choosing: seconds of the choice.
         seconds: from its beginning to the features.
         teacher: with the maps of a costly one that the choice made.
@@ -270,7 +268,6 @@ class SampledViews:
         maps: how many maps of a costly teacher were made, of the views that the order begins with.
         errors: of Gaussians of the sample with the first 1, 2, … of the views that were looked at; 1 where these do
             not show one.
-        views: number of all views.
     """
 
     order: tuple[int, ...]
@@ -297,7 +294,6 @@ def sample_views(
 
     Args:
         visibility: resolved; against sensor depth, or nothing.
-        config: of the exact settings.
     """
     count, spread = len(views), bisection_order(len(views))
     looked_at = spread[: max(ALL_VIEWS, math.ceil(count / VIEWS_SHARE))]
@@ -360,7 +356,6 @@ def mean_turn(
     Args:
         sums: weighted sums of the vectors that each map shows at each Gaussian.
         means: of the vectors of each map.
-        views: numbers of the maps' views.
     """
     maps, all_counts, all_weights = len(sums), (weights > 0).sum(axis=0), weights.sum(axis=0)
     total = sums.sum(axis=0, dtype=np.float64)

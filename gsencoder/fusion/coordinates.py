@@ -81,10 +81,7 @@ class Reduced(NamedTuple):
     """Features whose files keep a limit of megabytes.
 
     Attributes:
-        features: by teacher.
-        ranks: their coordinates.
         error: that leaving out coordinates adds, of the teacher that loses most.
-        megabytes: of all files.
     """
 
     features: dict[str, GaussianFeatures]

@@ -173,7 +173,6 @@ def field_error(
     """Compares two fields in the full space.
 
     Args:
-        reference: what is taken for right.
         sample: the most Gaussians, evenly spaced over all that the reference saw; 0 = all.
         rows: the Gaussians that are compared, which the reference saw; None = a sample.
     """

@@ -38,7 +38,6 @@ class SplatFrame:
     """A similarity from the world of a splat's file to that of the cameras: x_world = scale · rotation @ x + shift.
 
     Attributes:
-        name: for messages.
         from_file: whether a file of the scene says so.
         shift: world units of the cameras.
         intrinsics_factor: factor of K with which the photographs fit, in place of a similarity.

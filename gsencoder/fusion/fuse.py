@@ -79,7 +79,6 @@ class Fusion:
     Attributes:
         views: row numbers of the views that were used.
         depth_sources: the depth maps that visibility was tested against.
-        config: as it was given.
         teacher: as its maps were read: upright, and from files with `work`.
     """
 

@@ -35,7 +35,6 @@ class MeasuredHead:
     """An adapter head with the statistics of its outputs over a data set, and what the basis of the features costs it.
 
     Attributes:
-        mean: of the outputs.
         scale: root mean square distance of the outputs from their mean.
         cells: number of the vectors that were measured.
         cosine: mean cosine, about the mean, of its outputs for vectors in the basis with those for the full vectors.

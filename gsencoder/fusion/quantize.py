@@ -142,11 +142,9 @@ class CompactFeatures:
 
     Attributes:
         codes: of the seen rows, each row's bits one coordinate after the other, the first in the highest bit.
-        bits: of each coordinate.
         levels: what the codes of each coordinate stand for, 2ᵇ values each.
         weight_codes: of the seen rows; 0 = `lightest`, 255 = `heaviest`, and each step between is the same factor.
         rows: which Gaussians were seen, ascending, of `total`.
-        basis: what the coordinates stand for.
         error: 1 − mean centered cosine to what was compacted: over the seen rows, or over their kinds (a sample where
             each row counts by how few are like it), whichever is larger. Features at the space's mean have no cosine.
         lowest: the centered cosine that one row in a thousand is below.

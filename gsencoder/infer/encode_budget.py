@@ -115,7 +115,6 @@ class BudgetEncoding:
         features: by teacher, with as few coordinates as a limit of megabytes asks for; `encoded` before that.
         exact: the setting that errors are measured against.
         ranks: coordinates, by teacher; empty without a limit of megabytes.
-        predicted: by limit.
         choosing: seconds of the choice; `seconds` from its beginning to the features.
         notes: warnings about limits that are expected to be broken.
     """

@@ -408,7 +408,6 @@ def score_clusters(
 
     Args:
         labels: cluster of each selected Gaussian, −1 = none.
-        rows: the selected Gaussians.
         min_share: clusters with less than this share of the best one's weight are floaters and are left out.
     """
     total = float(weights.sum(dtype=np.float64))

@@ -72,7 +72,6 @@ class Selection:
     """A label for each Gaussian of a scene: 0 = none of the words, k + 1 = word k.
 
     Attributes:
-        seeds: the labels before they grew.
         views: number of views that corrected them.
         placed: whether these are cameras that were placed around or inside a splat without views.
     """
@@ -327,7 +326,6 @@ class Votes:
     """Blending weight of each Gaussian over the pixels of each label, summed over views; pixels of the whole picture.
 
     Attributes:
-        present: as the scene is.
         removed: as it is without the Gaussians that have a label; zeros for these. The pixels keep the labels that
             they had with them.
     """

@@ -57,7 +57,6 @@ class Level(NamedTuple):
         scatter_index: for each order, the slot of each token.
         attn_mask: for each order, False in slots of padding; None if no patch is padded. `RawEncoder` has gather_index,
             scatter_index and attn_mask as tuples, since its orders may have different numbers of patches.
-        patch_width: slots of a patch.
         parents: the token of the next coarser level that each token is pooled into; empty at the last level.
         children: for each token of the next coarser level, its eight tokens here; the first is repeated where there are
             fewer.
@@ -76,7 +75,6 @@ class Plan(NamedTuple):
     """The plan of a batch of clouds, N Gaussians and T tokens in all.
 
     Attributes:
-        token_of: the token of each Gaussian.
         members: the Gaussians sorted by token.
         counts: number of Gaussians of each token.
         levels: finest first.

@@ -150,7 +150,6 @@ class PruneConfig:
 
     Attributes:
         at: shares of the steps after which is pruned.
-        opacity: lower ones are taken out.
         screen: wider than this many times the picture's longer side in some view; 0 = any.
         contribution: less than this many pixels' worth in every photograph, at its full size.
     """
@@ -254,7 +253,6 @@ class Optimizer:
         anchor: keeps positions near their seeds; None = positions are free.
         exposures: affine color maps of the photographs; None where photographs are fitted as they are, because the
             settings say so or because their exposures do not differ.
-        step: number of steps done.
         is_consistent: whether the state is that between two steps, so that it may be saved.
         extent: length that the learning rate of positions is multiplied by, world units.
         most: number of Gaussians that pruning leaves at most; None = no limit.

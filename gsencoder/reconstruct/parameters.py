@@ -123,7 +123,6 @@ class RowAdam:
         parameters: float32 tensors of N rows each, stepped in place.
         averages: first moments by parameter.
         squares: second moments by parameter.
-        steps: steps that were taken.
     """
 
     KINDS = ("parameters", "averages", "squares")
@@ -318,8 +317,6 @@ class State:
         anchor: what holds positions near their seeds, if anything does.
         exposures: an affine map of colors for each fitted photograph, if they are fitted; None at step 0, and
             where photographs do not differ in exposure.
-        step: steps that are done.
-        seconds: that they took.
         facts: how it began, as JSON values: number and source of the seeds, what was added to points, and the plan.
     """
 

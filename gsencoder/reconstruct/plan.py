@@ -184,8 +184,6 @@ class Plan:
     """What a reconstruction is about to do.
 
     Attributes:
-        steps: of the optimization.
-        sh_degree: of colors.
         most: Gaussians that pruning leaves at most; None = no limit.
         spent: seconds before the first step.
         until: seconds after which no step begins; None without a limit of them.
@@ -221,7 +219,6 @@ def make_plan(
     """Plans a reconstruction that has not begun, and sets its colors; `apply_plan` carries the rest out.
 
     Args:
-        held_out: views that are validated on.
         validations: how many there are in a number of steps.
         double_means: whether the splat's positions are written as doubles.
         spent: seconds until now.

@@ -125,7 +125,6 @@ def initial_gaussians(
     """The first Gaussians of a scene: its own splat, else seeds from what its training views hold.
 
     Args:
-        photographs: of all its views.
         training: the views that may be looked at.
         dense: when points are added to those of structure from motion.
     """
@@ -249,7 +248,6 @@ class Reconstruction:
     Attributes:
         gaussians: relative to the scene's origin.
         seeding: number and source of the seeds, and what was added to structure-from-motion points, as JSON values.
-        steps: optimization steps that were done.
         training: row numbers of the views that were fitted.
         held_out: row numbers of the views that were not.
         log: one row a validation, oldest first; empty without held-out views.
@@ -260,7 +258,6 @@ class Reconstruction:
         held_out_colors: color maps to which held-out photographs are expected to be exposed, in their order; identities
             where `exposure` is None.
         seconds: wall-clock time by step of the stage.
-        plan: that was followed.
         elapsed: seconds from the first reading to the Gaussians and pictures, of all runs that it took.
     """
 
@@ -304,7 +301,6 @@ def reconstruct(
         made_from: what else a run must share with the run that it continues, as JSON values, such as the path and the
             reading options of the scene.
         spent: seconds that reading the scene took, which count to a limit of seconds.
-        now: the clock.
         report: receives a line after seeding and after each validation.
 
     Raises:

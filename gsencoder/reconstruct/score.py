@@ -136,10 +136,8 @@ class Score(NamedTuple):
 
     Attributes:
         psnr: in dB, of the pixels that masks leave, in the exposures that are predicted.
-        ssim: structural similarity of the same.
         matched_psnr: in dB, as psnr, after the colors of each render were fitted to its photograph by an affine map.
         seen_psnr: in dB, of those of them that some fitted photograph shows too; None where no sensor tells.
-        seen_ssim: structural similarity of the same.
         seen: share of the pixels that are such.
         floating: mean opacity where held-out photographs show that nothing is there; None where none shows that.
     """
@@ -268,8 +266,6 @@ class Comparison:
     """A held-out photograph and the render of the same view.
 
     Attributes:
-        name: of the view.
-        photograph: as decoded.
         render: of the reconstructed splat, in the exposure that is predicted; where photographs differ in exposure and
             nothing predicts it, in the colors that fit the photograph best.
     """

@@ -58,10 +58,7 @@ class Placed:
     """What structure from motion made of a folder of photographs.
 
     Attributes:
-        model: folder of the COLMAP model.
         placed: names of the photographs that have a pose.
-        missing: names of the others.
-        points: their number.
         error: mean reprojection error in pixels.
     """
 

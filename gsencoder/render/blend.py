@@ -44,10 +44,8 @@ class Blend:
 
     Attributes:
         crow: row starts, P + 1 of them; rows are pixels or patches, row-major.
-        col: Gaussian of each entry.
         weight: T·α of each entry, averaged over the row's rays.
         depths: z of each Gaussian in this camera, world units; only entries of `col` are meaningful.
-        lattice: where the rays are.
         config: the knobs it was made with.
     """
 

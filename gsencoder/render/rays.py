@@ -19,7 +19,6 @@ class Lattice:
     """Ray (i, j) pierces pixel coordinates (x0 + i·dx, y0 + j·dy); row (r, c) owns a side × side block of rays.
 
     Attributes:
-        height, width: rows of the grid.
         side: rays along one side of a cell.
         x0, y0: first ray, in pixels.
         dx, dy: distance between rays, in pixels.
@@ -78,7 +77,6 @@ def grid_lattice(grid_from_image: Float64[np.ndarray, "2 3"], width: int, height
     Args:
         grid_from_image: diagonal affine from pixel to grid coordinates; cell (r, c) covers [c, c+1) × [r, r+1).
         width: cells in a line of the grid.
-        height: lines of the grid.
         rays_per_patch: 1, 4, 9, 16, …
     """
     side = math.isqrt(max(rays_per_patch, 0))

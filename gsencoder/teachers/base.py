@@ -41,7 +41,6 @@ class TeacherSettings:
         """The teacher of a scene.
 
         Args:
-            scene: read by teachers with `per_scene`.
             words: from `gsencoder.teachers.build.words_of`, which is called once for many scenes.
         """
         raise NotImplementedError

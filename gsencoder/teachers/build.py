@@ -34,7 +34,6 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
     """The words of the teacher's space: its text table, or the vocabulary of a text tower; None where there are none.
 
     Args:
-        config: of the teacher.
         text: a tower whose vectors the teacher's features are, or are made to be; its own table is not read then.
     """
     if isinstance(text, TableTextConfig):
@@ -55,8 +54,6 @@ def words_by_teacher(
     """The words of each of several teachers that has any; a text tower is for those whose words it can be.
 
     Args:
-        teachers: by name.
-        text: see `words_of`.
         members: whether even a single teacher is given as one of `teachers=`, for errors.
     """
     several, has_tower = len(teachers) > 1, not isinstance(text, TableTextConfig)
@@ -141,7 +138,6 @@ def choose_teacher(
     are no error here, as they are for `teacher=labels`: the sentence encoder knows them.
 
     Args:
-        config: of the teacher.
         text: a tower that is given, or none.
         scene: its objects and instance maps are looked at.
         words_of: reads words; of a cached one they are read once for many scenes.

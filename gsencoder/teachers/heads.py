@@ -51,7 +51,6 @@ class Head:
     """An adapter head.
 
     Attributes:
-        name: ADAPTER.summary or ADAPTER.features.
         body: its layers, from features [n, D] of the backbone to vectors [n, E].
         text: the kind of model with a text side to whose space the adapter leads (clip, siglip, siglip2); else empty.
         model: the model to whose space it leads, as the configuration states it; else empty.

@@ -70,7 +70,6 @@ class PictureTeacher:
     """A teacher of dense maps that looks at one photograph at a time.
 
     Attributes:
-        subject: of messages.
         advice: what to check where features are not finite.
     """
 

@@ -35,8 +35,6 @@ class TowerKind:
     """How the vision towers of one kind are loaded and run.
 
     Attributes:
-        name: for people.
-        loader: class of transformers.
         weight: name, within the tower, of the weight of its patch embedding.
         joint: what leads from tokens into the space of a text tower: the visual projection, the attention pooling head,
             or nothing.

@@ -258,7 +258,6 @@ class JointText:
     """How the text side of a joint image-text model is run.
 
     Attributes:
-        loader: class of transformers.
         output: its output that lies in the joint space.
         pad: whether phrases are padded to the model's length, as in its training, rather than masked.
         lower: whether they are lower-cased and lose their punctuation, as in its training, which its tokenizer in

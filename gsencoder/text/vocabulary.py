@@ -32,7 +32,6 @@ class OpenVocabulary:
 
     Attributes:
         table: names with their vectors; its mean and its space are those of the encoder.
-        record: which tower made the table.
     """
 
     def __init__(self, table: TextTable, open_tower: Callable[[], TextTower]) -> None:

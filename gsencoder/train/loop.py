@@ -400,7 +400,6 @@ class Trainer:
 
         Args:
             network: trained in place and moved to `device`.
-            dataset: the training samples, by number.
             objective: gives the loss of the network once it is wrapped for several processes.
             collate: joins samples to a batch: tuples and mappings of tensors, with the `names` of the samples.
             folder: existing folder for checkpoint and log.

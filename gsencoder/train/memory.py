@@ -95,7 +95,6 @@ def prepare_memory(
     """Prepares a scene for one teacher, or opens what was prepared in this folder before.
 
     Args:
-        scene: with Gaussians and views.
         folder: created if it does not exist.
         predicted: features of the teacher's space that an encoder predicts for the scene; None = they are fused.
         sample: number of raw features that are stored beside the bank for `open_raw_sample`, or all if there are fewer.

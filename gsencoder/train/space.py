@@ -116,7 +116,6 @@ def dataset_space(
     """Computes the output space of a dataset.
 
     Args:
-        scenes: all scenes to train on.
         open_scene: reads a scene and builds its teacher.
         config: the basis, the number of maps of a dense teacher, and whether targets are centered and scaled.
         optional: leave out scenes that lack what the teacher needs, since they have other teachers.

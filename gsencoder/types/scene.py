@@ -417,7 +417,6 @@ class Teacher(Protocol):
     A teacher may also have `kinds`, the names that its maps show; they are stored with the features as words.
 
     Attributes:
-        space: what its vectors are.
         table: the vectors that all its maps are codes into or shares of; None where maps are dense or each has its own
             table.
         mean: the space's mean, where it is known without looking at the scene.

@@ -159,7 +159,6 @@ def entries_of(rows: Any, path: Path, expected: str, *, key: str = "") -> tuple[
     """The entries of a list of JSON objects, each with its place for messages.
 
     Args:
-        expected: the keys of an entry.
         key: under which the list stands in the file; empty = the file is the list.
     """
     if not isinstance(rows, list):

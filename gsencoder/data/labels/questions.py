@@ -194,7 +194,6 @@ def write_sqa3d(path: str | Path, questions: Sequence[Question]) -> Path:
 
     Args:
         path: of the file of questions, whose name must have "questions" in it.
-        questions: with situation, position and rotation.
 
     Returns:
         The file of annotations beside it, where `read_questions` looks for it.

@@ -166,7 +166,6 @@ class MaskFiles(PictureFiles[Bool[np.ndarray, "H W"]]):
     background of one color.
 
     Args:
-        paths: mask files.
         outlined: photographs of which transparency, or `background`, tells where something is.
     """
 

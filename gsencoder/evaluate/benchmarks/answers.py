@@ -205,7 +205,6 @@ def score_answers(
     Args:
         questions: with right answers, each id once.
         predictions: by the id of the question, one to ten answers, best first; a question that is missing scores 0.
-        tools: see `score_sentences`.
         lemmatize: of `wordnet_lemmatizer`, a reason for going without, or None = look for it.
     """
     lemmatize = wordnet_lemmatizer() if lemmatize is None else lemmatize

@@ -97,7 +97,6 @@ def scene_files(
 
     Args:
         scenes: those to score, such as the ones of a split; None = all of the labels.
-        suffixes: of prediction files.
         scans: whether `labels` has the folders of ScanNet's scans, each with the label files of its scene.
     """
     for folder in (predictions, labels):

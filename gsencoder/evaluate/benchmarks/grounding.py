@@ -137,9 +137,6 @@ def otsu_threshold(values: Float32[np.ndarray, "*shape"]) -> float:
     n₁(k) · n₂(k) · (m₁(k) − m₂(k))², with the numbers and mean values of both classes, where a bin stands for its
     center. The threshold is the center of bin k; of equal splits the first is taken.
 
-    Args:
-        values: finite, one or more.
-
     Returns:
         The threshold; values above it are the upper class. The value itself where all are equal, so that none is above.
     """

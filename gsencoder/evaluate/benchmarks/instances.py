@@ -174,11 +174,7 @@ def predict_instances(
     protocol: InstancesProtocol = InstancesProtocol(),
     localization: LocalizeConfig = LocalizeConfig(),
 ) -> InstancePrediction:
-    """Masks of a scene's points, each with a class and a score.
-
-    Args:
-        localization: for clusters.
-    """
+    """Masks of a scene's points, each with a class and a score."""
     ids = classes.id_of
     if protocol.proposals == "clusters":
         queried = replace(scene, features={features.space.name: features})
@@ -293,7 +289,6 @@ class SceneMatches:
     """Which predictions of a scene are right, at each threshold: all that scores need of it.
 
     Attributes:
-        class_agnostic: whether classes were looked at.
         instances: numbers of instances by class (one class where they were not looked at).
         predictions: numbers of predictions that count, by class.
         shared: number of these predictions that are above the lowest threshold with several instances.

@@ -123,7 +123,6 @@ def warn_of_gaps(counts: Sequence[tuple[str, int]], what: str, advice: str) -> N
 
     Args:
         counts: names of the scenes, and how much each has.
-        what: that, after "no".
     """
     empty = [scene for scene, count in counts if not count]
     if len(empty) == len(counts):

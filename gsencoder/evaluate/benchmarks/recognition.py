@@ -77,9 +77,7 @@ class RecognitionScores(NamedTuple):
     """The accuracies of instances, for each k; NaN without any.
 
     Attributes:
-        classes: by name of the class.
         mean: over the classes that have instances.
-        overall: over instances.
     """
 
     classes: dict[int, dict[str, float]]

@@ -222,7 +222,6 @@ def score_views(
 
     Args:
         directions: of the texts, unit vectors (`word_directions`).
-        memory: as of `Evaluation.memory_of`.
     """
     assert scene.gaussians is not None
     assert scene.views is not None

@@ -210,7 +210,6 @@ class SemanticScores:
             labeled, macc: mean accuracy of these, accuracy: share of their vertices that are right.
         classes: by name iou (NaN if it is neither labeled nor predicted), accuracy (NaN if it is not labeled), and the
             vertices that have it: truths, and predictions of those that are not ignored.
-        vertices: that count.
         ignored: vertices whose true label is no class.
         unlabeled: vertices that count, and are predicted as no class.
     """

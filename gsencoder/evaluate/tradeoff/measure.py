@@ -65,7 +65,6 @@ class Records:
     def __init__(self, folder: Path | None = None, identity: Mapping[str, Any] = {}) -> None:
         """Args:
         folder: holds what an earlier run of the same sweep measured, or nothing; None = nothing is written.
-        identity: as JSON values.
         """
         self._by_key: dict[tuple[str, str, str], Record] = {}
         self._path = None if folder is None else folder / RECORDS_FILE

@@ -284,7 +284,6 @@ class EncoderSettings:
     """Which encoder runs, and how; 0 = as in its training.
 
     Attributes:
-        weights: see `gsencoder.models.output_space.find_weights`.
         graph: precision of an ONNX graph that is run in place of torch; none = torch.
         voxel: edge of the token grid in metres.
         patch: largest number of tokens of a patch.

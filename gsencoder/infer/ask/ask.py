@@ -186,7 +186,6 @@ class Prompt:
     Attributes:
         targets: what the pictures are of, in the order of their marks.
         boxes: the boxes of the targets, where words found them.
-        words: that were looked for.
         absent: those of them that are probably absent, and the probability that they are not.
         marks: the numbers that the pictures carry.
     """

@@ -54,11 +54,9 @@ class EncoderHeader:
 
     Attributes:
         voxel: edge of the finest grid, metres.
-        orders: the curves that attention follows.
         patch: most tokens in a patch.
         outputs: what the features mean; the graph has restored them already.
         tables: what turns words into their spaces, by teacher, where there are such tables.
-        precision: what the graph computes in.
         made_by: settings and results of training and export, as JSON values.
     """
 
@@ -276,11 +274,7 @@ class Network(Protocol):
 
 
 class OnnxNetwork:
-    """A file of `gsencoder export`, ready to run.
-
-    Attributes:
-        name: of the file, for messages.
-    """
+    """A file of `gsencoder export`, ready to run."""
 
     def __init__(self, file: str | Path | bytes, *, device: Device = "auto", threads: int = 0) -> None:
         """Reads and checks the file.

@@ -101,7 +101,6 @@ class BudgetViews:
         pictures: of the views, with a limit of megabytes.
         order: which candidates the views are, with a limit of error.
         chosen: values that were chosen, by name.
-        predicted: by limit.
         seconds: from the beginning to the choice, without the pictures.
         notes: warnings about limits that are expected to be broken.
     """

@@ -207,7 +207,6 @@ def tower_grid(width: int, height: int, grid: tuple[int, int], fit: Fit = "stret
     Args:
         width: of the picture, pixels.
         height: of the picture, pixels.
-        grid: rows and columns of patches.
         fit: stretch = the whole picture is resized to the tower's, whatever its shape; crop = it is resized until it
             covers the tower's, and the middle is cut out. Square pictures need neither, nor the padding of towers that
             make a square by it.

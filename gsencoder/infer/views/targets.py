@@ -212,7 +212,6 @@ class SelectedView:
         gain: what it added to the choice, with a budget of error by how much it lowered that; None for uniform frames.
         covered: how well this view and those before it show the targets' Gaussians, by `coverage`: 1 = each as well
             as the candidate that shows it best; None where there are no targets.
-        target_scores: one for each target.
     """
 
     name: str
@@ -228,7 +227,6 @@ class ViewSet:
     """Views that were chosen, best first (or in the scene's order where uniform), relative to the scene's origin.
 
     Attributes:
-        judged: how many candidates there were.
         near: near plane for their renders, world units: scenes of small units are not cut open.
     """
 
