@@ -9,8 +9,8 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -443,11 +443,11 @@ class Trainer:
     def run(self, track: Track = untracked) -> TrainingState:
         """Runs the remaining steps. An error of a sample, or of a loss or gradient that is not finite, names the
         samples and the term; parameters are not changed."""
-        with lost_workers(), self._saving_when_stopped():
+        with lost_workers(), closing(self._micro_batches(track)) as remaining, self._saving_when_stopped():
             start, saved = time.monotonic() - self.state.seconds, time.monotonic()
             if not self.state.closed:
                 self._close_step()
-            for step, items in self._micro_batches(track):
+            for step, items in remaining:
                 with lost_processes(self.process, distributed.STEP_MINUTES):
                     losses = self._gradients(step, items)
                 unlogged = (*self.state.unlogged, losses)
@@ -482,7 +482,7 @@ class Trainer:
             path = self.folder / TRAINING_CHECKPOINT_FILE
             save_checkpoint(path, self.network, self.optimizer, self.state, self.settings)
 
-    def _micro_batches(self, track: Track) -> Iterator[tuple[int, list[Any]]]:
+    def _micro_batches(self, track: Track) -> Generator[tuple[int, list[Any]], None, None]:
         """The remaining steps, each with the micro-batches of this process, or the errors of their samples."""
         config, process, first = self.config, self.process, self.state.step
         workers = automatic_workers(self.device, process) if config.workers is None else config.workers
@@ -500,10 +500,15 @@ class Trainer:
             prefetch_factor=config.prefetch if workers else None,
         )
         batches, threads = iter(loader), torch.get_num_threads()
-        for step in track(range(first, config.steps), "training"):
-            with threads_of_torch(threads if workers else min(SAMPLE_THREADS, threads)):
-                items = [next(batches) for _ in range(accumulate)]
-            yield step, items
+        try:
+            for step in track(range(first, config.steps), "training"):
+                with threads_of_torch(threads if workers else min(SAMPLE_THREADS, threads)):
+                    items = [next(batches) for _ in range(accumulate)]
+                yield step, items
+        finally:
+            if workers:
+                # They ignore signals; Python would wait for them at its end wherever a traceback keeps the iterator.
+                batches._shutdown_workers()  # type: ignore[attr-defined]
 
     def _gradients(self, step: int, items: list[Any]) -> dict[str, float]:
         """Computes the gradients of one optimizer step; returns the losses over all processes."""
