@@ -35,6 +35,7 @@ from gsencoder.core.files import (
     write_bytes,
     write_json,
 )
+from gsencoder.core.process import status_kib
 from gsencoder.core.threads import available_cores
 
 LIBRARIES = (
@@ -48,9 +49,7 @@ def peak_memory_mb() -> float:
     """Peak resident memory of this process, MiB."""
     # On Linux ru_maxrss starts from the size of the parent at the fork; VmHWM is that of the process alone.
     with suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
+        return status_kib("VmHWM") / 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 2**20
 
 

@@ -293,29 +293,20 @@ def memory_growth() -> Iterator[Growth]:
         ctypes.CDLL(None).malloc_trim(0)
     try:
         CLEAR.write_text("5")
-        before = _kib("VmRSS")
+        before = status_kib("VmRSS")
     except OSError:
         yield growth
         return
     yield growth
-    growth.mib = max(_kib("VmHWM") - before, 0) / 1024
+    growth.mib = max(status_kib("VmHWM") - before, 0) / 1024
 
 
-def _kib(name: str, file: Path | None = None) -> int:
-    for line in (file or STATUS).read_text().splitlines():
+def status_kib(name: str) -> int:
+    """A size of this process in KiB by its name in /proc/self/status, which Linux has; OSError elsewhere."""
+    for line in STATUS.read_text().splitlines():
         if line.startswith(name + ":"):
             return int(line.split()[1])
-    raise OSError(f"{file or STATUS} has no {name}")
-
-
-MEMINFO = Path("/proc/meminfo")
-
-
-def free_memory() -> int:
-    """Bytes that can be taken without swapping, as the system estimates them; where it does not, half of all memory."""
-    with suppress(OSError):
-        return 1024 * _kib("MemAvailable", MEMINFO)
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    raise OSError(f"{STATUS} has no {name}")
 
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
