@@ -59,8 +59,8 @@ ALL_VIEWS, VIEWS_SHARE = 24, 2
 """The smallest number of views that are looked at on a few rays, and of how many one is, if that is more. A scene of
 fewer views and a cheap teacher is fused exactly: looking at a view costs half as much as fusing it."""
 FIRST_MAPS, MAPS_SHARE = 4, 4
-"""A costly teacher's maps of so many views are made to choose by, or of one of so many if that is more; all of them are
-lifted."""
+"""The number of a costly teacher's maps that are made to choose by: one of `MAPS_SHARE` views, and at least
+`FIRST_MAPS`; all of them are lifted."""
 CHEAP_MAPS = 8
 """The same of a cheap teacher, whose maps are made again."""
 DIRECTIONS = 1024

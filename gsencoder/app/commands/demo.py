@@ -106,8 +106,9 @@ def run(config: DemoConfig, run: Run) -> None:
             search(scene, palette, colors, unrepeated(by_color), config, folder / "colors", run),
         )
         for result in results:
+            figures = result.to_dict()
             run.print(
-                f"{result.title}: features of {result.to_dict()['rank']} of {result.to_dict()['channels']} channels; "
+                f"{result.title}: features of {figures['rank']} of {figures['channels']} channels; "
                 f"{result.num_localized} of {len(result.words)} words localized (IoU ≥ 0.5), mean IoU "
                 f"{result.mean_iou:.2f}"
             )

@@ -104,7 +104,7 @@ def run(config: FuseCommandConfig, run: Run) -> None:
     outputs = load_output_spaces(config.basis, "basis") if config.basis else None
 
     def one(path: Path, out: Path, run: Run) -> None:
-        work = out.parent / f".{out.name}.fusing"  # maps and sums of an unfinished fusion
+        work = out.parent / f".{out.name}.fusing"  # maps of an unfinished fusion
         with run.folder(out) as folder:
             scene = load_fusable(
                 path,

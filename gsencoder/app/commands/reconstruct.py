@@ -196,7 +196,7 @@ def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructComman
 def _at_scale(
     opened: OpenedScene, scale: float, path: Path, work: Path, config: ReconstructCommandConfig, run: Run
 ) -> OpenedScene:
-    """The scene with photographs that are so many times as large."""
+    """The scene with photographs that are larger by a factor."""
     views = opened.scene.views
     if scale == 1 or views is None:
         return opened

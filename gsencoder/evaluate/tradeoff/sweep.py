@@ -412,7 +412,7 @@ def scene_row(record: Record) -> dict[str, Any]:
 LEAST_EFFECT = 0.02
 """A knob that changes the cost by less than this share does not matter for it, however well that is measured."""
 NOISE_ERRORS = 2.0
-"""An effect is noise if it is not larger than so many standard errors."""
+"""An effect is noise if it is not larger than this number of standard errors."""
 
 
 def knobs_that_matter(
