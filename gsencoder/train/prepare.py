@@ -420,7 +420,7 @@ class PreparedDataset:
 
 
 def _seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
-    """The targets of the seen Gaussians of a scene, or at most `max_targets` of them, evenly spaced; the scene is closed."""
+    """The targets of the seen Gaussians of a scene, at most `max_targets` of them, evenly spaced; it is closed."""
     rows = np.flatnonzero(scene.weights)
     targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
     scene.close()
