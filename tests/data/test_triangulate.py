@@ -9,8 +9,9 @@ from walls import DEPTH, TILT, wall_points, wall_views
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.orbits import looking_cameras
+from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.seeding.from_photographs import seed_from_photographs
+from gsencoder.data.seeding.from_photographs import seed_from_photographs, seeds_of_photographs
 from gsencoder.data.seeding.matches import (
     triangulate,
     typical_distance,
@@ -80,6 +81,15 @@ def test_views_that_look_away_from_each_other_are_refused(no_jaxtyping):
 def test_one_photograph_is_refused():
     with pytest.raises(InputError, match="1 photograph without depth and points says nothing about where surfaces are"):
         seed(Scene(name="one", views=wall_views(1)), SeedConfig(source="photographs"))
+
+
+@pytest.mark.slow
+def test_a_room_is_seeded_on_its_surfaces_although_few_features_match(shared):
+    scene = load_scene(shared / "scenes" / "house" / "train_041", options=SceneConfig(max_views=8))
+    made = seeds_of_photographs(Photographs(scene.views), replace(scene.views, depths=None))
+    assert len(made.points) > 1000
+    distance = cKDTree(seed(scene).means).query(made.points)[0]
+    assert np.median(distance) < 0.04
 
 
 @pytest.mark.slow
