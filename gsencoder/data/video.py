@@ -16,7 +16,7 @@ from jaxtyping import Float, Int64, UInt8
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files import check_foreign, read_foreign_text, write_json, write_picture
 from gsencoder.core.process import Track, untracked
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 
 SIZE = 640  # Longer side in pixels of the pictures whose sharpness is measured; motion is measured at half of it
 BLOCK = 64  # Side in pixels of the blocks whose motion is measured
@@ -228,16 +228,13 @@ QUALITY = 95  # Of the JPEG files
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VideoConfig:
+class VideoConfig(CheckedConfig):
     """Which frames of a video become photographs."""
 
     frames: int = option(100, "most frames that are taken of a video", ge=3)
     motion: float = option(
         0.08, "by what share of its width the picture moves from one frame to the next", ge=0.001, le=1
     )
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 def take_frames(

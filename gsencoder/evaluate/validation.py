@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from gsencoder.core.errors import about
+from gsencoder.core.errors import error_prefix
 from gsencoder.core.process import Track, untracked
 from gsencoder.infer.draw import contact_sheet, fit_pca_colors, pca_picture
 from gsencoder.infer.encode import EncodeConfig, Encoder
@@ -141,7 +141,7 @@ def validate_encoder(
     network = Encoder(TorchNetwork(encoder, outputs))
     for scene in track(share, "validation"):
         gaussians = scene.first.gaussians(np.arange(len(scene.first)))
-        with about(f"scene {scene.name}"):
+        with error_prefix(f"scene {scene.name}"):
             unit = scene.first.metres_per_unit or 1.0
             encoded = network.encode_spaces(gaussians, config, metres_per_unit=unit)
         for (teacher, accuracy), part in zip(accuracies.items(), scene.parts, strict=True):

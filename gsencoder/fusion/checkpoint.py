@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.archive import open_archive, write_archive
-from gsencoder.core.errors import InputError, advised
+from gsencoder.core.errors import InputError, error_hint
 from gsencoder.core.files import atomic_file, read_foreign_text
 from gsencoder.core.settings import first_difference
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Gaussians, Teacher, Views
@@ -121,7 +121,7 @@ class CachedTeacher(WrappedTeacher):
         self._folder, self._settings, self._advice = folder, settings, ""
         if settings is not None:
             self._advice = f"delete {folder} to start again"
-            with advised(self._advice):
+            with error_hint(self._advice):
                 # As JSON gives them back.
                 self._check_settings(json.loads(json.dumps(settings)))
 
@@ -143,7 +143,7 @@ class CachedTeacher(WrappedTeacher):
                 with atomic_file(self._folder / SETTINGS_FILE) as stream:
                     stream.write(json.dumps(self._settings).encode())
             write_map(path, feature_map, with_table=feature_map.table is not None and self.table is None)
-        with advised(self._advice or f"remove {path}, and it is made again"):
+        with error_hint(self._advice or f"remove {path}, and it is made again"):
             return read_map(path, self.space, self.table)
 
     def _check_settings(self, settings: Mapping[str, Any]) -> None:

@@ -27,7 +27,7 @@ from gsencoder.core.archive import (
     verify_archive,
     write_archive,
 )
-from gsencoder.core.arrays import rise_within
+from gsencoder.core.arrays import is_strictly_increasing
 from gsencoder.core.errors import InputError
 from gsencoder.core.threads import parallel
 from gsencoder.data.scene_arrays import (
@@ -81,7 +81,7 @@ def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
     check_splat(file, gaussians, "make the memory of this splat again")
     space, mean, basis = read_space(file)
     rows, count = file.array("rows", "int32", ("n",)), len(gaussians)
-    if not rise_within(rows, count):
+    if not is_strictly_increasing(rows, count):
         raise InputError(f"expected row numbers that rise from 0 to at most {count - 1}")
     seen = file.array("weights", "float32", (len(rows),))
     if (seen <= 0).any():
@@ -338,7 +338,7 @@ def _load_rows(folder: Path, name: str, gaussians: Gaussians) -> GaussianFeature
     with _open(folder, name) as file:
         check_splat(file, gaussians, "fuse or encode this splat again")
         rows, n = file.array("rows", "int32", ("n",)), len(gaussians)
-        if not rise_within(rows, n):
+        if not is_strictly_increasing(rows, n):
             raise InputError(f"expected row numbers that rise from 0 to at most {n - 1}")
         scale = file.array("channel_scale", "float32", ("R",))
         seen = file.array("weights", "float32", ("n",))

@@ -21,7 +21,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Track, timed, untracked
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import ahead, thread_count
 from gsencoder.fusion.basis import Moments, distinct_rows, fit_basis, table_basis
 from gsencoder.fusion.checkpoint import cached_maps, upright
@@ -37,7 +37,7 @@ NARROW = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FuseConfig:
+class FuseConfig(CheckedConfig):
     """How maps become per-Gaussian features."""
 
     lift: Literal["blend", "center"] = option(
@@ -59,9 +59,6 @@ class FuseConfig:
     view_choice: Literal["even", "coverage"] = option(
         "even", "which views are used: evenly spaced ones, or the ones that show most of the Gaussians"
     )
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
     @property
     def table_energy(self) -> float:

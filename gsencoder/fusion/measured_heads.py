@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.device import choose_device
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, error_prefix
 from gsencoder.fusion.basis import WORST, to_coordinates
 from gsencoder.fusion.folder import check_heads_space, read_heads_space
 from gsencoder.teachers.heads import PARTS, TEXT_KINDS, Head, Residual, default_part, split_name
@@ -155,7 +155,7 @@ def head_features(
         features: of the space `backbone`, which the head takes, in a basis or not.
         text_encoder: what turns words into the head's space.
     """
-    with about(head.name):
+    with error_prefix(head.name):
         check_heads_space(backbone, features.space)
     seen = np.flatnonzero(features.seen)
     first, inverse = equal_rows(features.stored(seen))

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from gsencoder.core.arrays import even_indices, rise_within
+from gsencoder.core.arrays import even_indices, is_strictly_increasing
 from gsencoder.core.budget import MEGABYTE, Budget
 from gsencoder.core.errors import InputError
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
@@ -172,7 +172,7 @@ class CompactFeatures:
             and self.codes.shape == (rows, -(-int(counts.sum()) // 8))
             and len(self.levels) == int((1 << counts).sum())
             and len(self.weight_codes) == rows > 0
-            and rise_within(self.rows, self.total)
+            and is_strictly_increasing(self.rows, self.total)
             and tiny <= self.lightest <= self.heaviest <= largest
             and 0 <= self.error <= 2
         )

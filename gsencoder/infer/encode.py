@@ -19,7 +19,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import write_bytes
 from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device, Precision, Track, untracked
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import ahead
 from gsencoder.fusion.errors import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
@@ -46,7 +46,7 @@ COSINE = 0.99
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EncodeConfig:
+class EncodeConfig(CheckedConfig):
     """The size of chunks and their halo, and where and in what precision the encoder computes."""
 
     chunk: int = option(
@@ -59,9 +59,6 @@ class EncodeConfig:
         "auto", "type that the encoder computes in; auto = bfloat16 on a CPU that multiplies it, else float32"
     )
     device: Device = option("auto", "where the encoder computes")
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 class Encoder:

@@ -19,7 +19,7 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image, ImageDraw
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.infer.draw import contact_sheet, draw_labels, draw_ring, enlarge, legible_factor, relevancy_overlay
 from gsencoder.infer.localize import select_features
 from gsencoder.infer.pictures import pixel_features
@@ -39,7 +39,7 @@ BLOCK_WORDS = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FromPoseConfig:
+class FromPoseConfig(CheckedConfig):
     """How words are found in a view."""
 
     mode: Mode = option("centered", "cosines after removing each side's mean (centered), or as they are (raw)")
@@ -51,9 +51,6 @@ class FromPoseConfig:
         "memory, whose attention takes longer, or fewer in large views",
         ge=1,
     )
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, Integer
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.data.seeding.points import scene_spacing
 from gsencoder.infer.relevancy import Cluster, Evidence, Presence, ThresholdConfig, probability, relevancy, threshold
 from gsencoder.text.table import TextEncoder, TextTable, check_space
@@ -40,7 +40,7 @@ EMPTY_EXTENT = 1e-5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LocalizeConfig:
+class LocalizeConfig(CheckedConfig):
     """How words become boxes. Relative lengths are in units of the scene's spacing
     (`gsencoder.data.seeding.points.scene_spacing`)."""
 
@@ -78,9 +78,6 @@ class LocalizeConfig:
         ge=0,
         le=1,
     )
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 _DEFAULT = LocalizeConfig()

@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures
 
@@ -227,7 +227,7 @@ NORMAL_MAD = 1.4826
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ThresholdConfig:
+class ThresholdConfig(CheckedConfig):
     """Which relevancy a Gaussian needs to be taken, for each word on its own."""
 
     kind: Kind = option(
@@ -239,9 +239,6 @@ class ThresholdConfig:
     relative: float = option(
         0.7, "share of the word's highest relevancy for kind=adaptive and kind=relative", gt=0, le=1
     )
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 def threshold(scores: Float32[np.ndarray, " N"], config: ThresholdConfig) -> float:

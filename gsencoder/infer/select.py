@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Track, untracked
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.fusion.cameras import with_views
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, select_features, spacing_of
 from gsencoder.render import blend
@@ -36,7 +36,7 @@ from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Localization, 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SelectConfig:
+class SelectConfig(CheckedConfig):
     """How the Gaussians of a box become those of an object. Lengths are in spacings of the scene
     (`gsencoder.data.seeding.points.scene_spacing`)."""
 
@@ -54,9 +54,6 @@ class SelectConfig:
         4.0, "no Gaussian farther than this from those of a box is taken, in spacings", ge=0, lt=math.inf
     )
     views: int = option(48, "number of views, evenly spaced, that are looked at; 0 = none", ge=0)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 PROBABLE = 0.5

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.core.archive import RowFile
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, error_prefix
 from gsencoder.core.settings import check_limits, option
 from gsencoder.memory.reduction import (
     ROUNDING,
@@ -170,7 +170,7 @@ class _Builder:
         for view, feature_map in self._maps():
             rows, sources = raw_features(view, feature_map)
             self._grids[view], self._coded[view] = feature_map.grid_from_image, feature_map.codes is not None
-            with about(f"view {view}"):
+            with error_prefix(f"view {view}"):
                 centered = rows - self._mean
                 lengths = np.abs(centered).max(axis=1, initial=0)
                 if not np.isfinite(lengths).all():

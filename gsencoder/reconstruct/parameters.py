@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from gsencoder.core.archive import open_archive, write_archive
-from gsencoder.core.errors import InputError, advised
+from gsencoder.core.errors import InputError, error_hint
 from gsencoder.core.settings import first_difference
 from gsencoder.core.threads import PIECES, kernel, parallel
 from gsencoder.geometry import colors_from_sh, normalize_quats, project_points, transform
@@ -366,7 +366,7 @@ def load_state(path: Path, settings: Mapping[str, Any], *, sh_degree: int, devic
     Raises:
         InputError: damaged, or of a run with other settings; the first that differs is named.
     """
-    with advised(f"give resume=false to start again, or remove {path}"), open_archive(path) as file:
+    with error_hint(f"give resume=false to start again, or remove {path}"), open_archive(path) as file:
         earlier = file.value("settings", dict)
         if earlier != settings:
             raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")

@@ -16,7 +16,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.budget import reject_options_set_by_budget
 from gsencoder.core.device import choose_device
-from gsencoder.core.errors import InputError, SceneWarning, advised
+from gsencoder.core.errors import InputError, SceneWarning, error_hint
 from gsencoder.core.files import plain
 from gsencoder.core.logs import LOG_FILE, Log, read_log
 from gsencoder.core.process import Clock, Device, Track, defer_signals, untracked
@@ -192,7 +192,7 @@ class Validation:
     """
 
     def __init__(self, optimizer: Optimizer, held_out: Sequence[int], work: Path, report: Report) -> None:
-        with advised(START_AGAIN):
+        with error_hint(START_AGAIN):
             self._log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
             try:
                 rows = read_log(work / LOG_FILE)

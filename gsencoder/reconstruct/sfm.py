@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from gsencoder.core.errors import InputError, SceneWarning, advised, listed
+from gsencoder.core.errors import InputError, SceneWarning, error_hint, listed
 from gsencoder.core.files import atomic_file, read_foreign_text, sha256_of
 from gsencoder.core.process import Clock, Track, untracked
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.data.readers.images import check_picture
 from gsencoder.data.readers.posed import inside
 from gsencoder.data.readers.undistort import load_pycolmap
@@ -38,7 +38,7 @@ MAX_THOROUGH, ENOUGH_PLACED = 30, 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SfmConfig:
+class SfmConfig(CheckedConfig):
     """How photographs are placed."""
 
     pairs: Literal["auto", "exhaustive", "sequential"] = option(
@@ -48,9 +48,6 @@ class SfmConfig:
     )
     size: int = option(1600, "longer side in pixels at which features are sought", ge=64, le=100_000)
     features: int = option(8192, "most features of a photograph", ge=64, le=1_000_000)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -372,6 +369,6 @@ def open_scene(
             SceneWarning,
             stacklevel=2,
         )
-    with advised(START_AGAIN):
+    with error_hint(START_AGAIN):
         scene = load_scene(work, options=replace(data, images=str(pictures)))
     return OpenedScene(scene=scene, sfm=placed, photographs=pictures, is_video=path.is_file(), seconds=clock.seconds)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.render import blend_cpu, blend_torch
 from gsencoder.render.rays import Lattice, grid_lattice, patch_lattice, strided_lattice
 from gsencoder.types import Cameras, FeatureMap, Gaussians
@@ -24,7 +24,7 @@ Backend = Literal["auto", "cpu", "torch", "reference"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BlendConfig:
+class BlendConfig(CheckedConfig):
     """The accuracy knobs of B, each an explicit bound: a row loses at most (entries dropped) × min_weight. The backend
     "auto" is "cpu" on a CPU in float32, else "torch"."""
 
@@ -34,9 +34,6 @@ class BlendConfig:
     near: float = option(0.01, "near plane in world units", gt=0)
     eps2d: float = option(0.3, "low-pass variance of projected Gaussians in pixels²", gt=0)
     backend: Backend = option("auto", "cpu (numba), torch, reference (its twin), or auto")
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 class Blend:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import PIECES, even_cuts, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render import blend_torch
@@ -34,16 +34,13 @@ RasterBackend = Literal["auto", "cpu", "reference", "gsplat"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RasterConfig:
+class RasterConfig(CheckedConfig):
     """Accuracy knobs of differentiable rendering; as those of a Blend, with no smallest weight."""
 
     stop_transmittance: float = option(1e-4, "transmittance at which a ray ends; always 1e-4 with gsplat", gt=0, lt=1)
     near: float = option(0.01, "near plane in world units", gt=0)
     eps2d: float = option(0.3, "low-pass variance of projected Gaussians in pixels²", gt=0)
     backend: RasterBackend = option("auto", "cpu (numba), reference (torch), gsplat (CUDA), or auto")
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 class Raster(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import find_file
-from gsencoder.core.settings import check_limits
+from gsencoder.core.settings import CheckedConfig
 from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import FeatureSpace, Scene
@@ -19,7 +19,7 @@ class MissingInput(InputError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TeacherSettings:
+class TeacherSettings(CheckedConfig):
     """The settings of a teacher, which answer for it: how it is built, and which words lead into its space.
 
     A subclass has a field `name: Literal["…"]`, the value of `teacher=`, and a line in `gsencoder.teachers.build`.
@@ -33,9 +33,6 @@ class TeacherSettings:
     per_scene: ClassVar[bool] = False
     needs_labels: ClassVar[bool] = False
     has_heads: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
     def build(self, scene: Scene, words: Words | None) -> Teacher:
         """The teacher of a scene.

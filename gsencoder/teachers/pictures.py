@@ -16,7 +16,7 @@ from gsencoder.core.device import enough_memory, teacher_autocast
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import digest_files, open_session
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.teachers.base import MissingInput, settings_of
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
@@ -106,7 +106,7 @@ def check_finite(values: Float32[np.ndarray, "..."], subject: str, advice: str) 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OnnxOptions:
+class OnnxOptions(CheckedConfig):
     """How pictures are given to an .onnx file, and which of its outputs is read."""
 
     output: str = option("", "output tensor; empty = the model's first")
@@ -114,9 +114,6 @@ class OnnxOptions:
     scale: float = option(255.0, "8-bit values are divided by this, then mean and std apply", ge=1e-6, le=1e6)
     mean: tuple[float, float, float] = option((0.485, 0.456, 0.406), "subtracted per channel", ge=-1e6, le=1e6)
     std: tuple[float, float, float] = option((0.229, 0.224, 0.225), "divided per channel", ge=1e-6, le=1e6)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 ONNX_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}

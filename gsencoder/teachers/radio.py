@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.device import choose_device
-from gsencoder.core.errors import InputError, about, listed
+from gsencoder.core.errors import InputError, error_prefix, listed
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import digest_files, find_file, load_pretrained, read_config, read_weights, weight_names
 from gsencoder.core.process import Device
@@ -154,7 +154,7 @@ def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[
         channels: D of the backbone.
     """
     files = weight_names(folder, WHAT)
-    with about(f"heads of {folder}"):
+    with error_prefix(f"heads of {folder}"):
         config = _read_config(folder)
         heads = [_read_head(folder, files, config, name, channels) for name in names]
     return list({head.name: head for head in heads}.values())
@@ -187,7 +187,7 @@ def _read_head(folder: Path, files: Mapping[str, Path], config: Mapping[str, Any
     kind = text_kind(type_and_model, adapter)
     part = part or default_part(kind)
     full = f"{adapter}.{part}"
-    with about(full):
+    with error_prefix(full):
         version = _version(args, part)
         sizes = _sizes(adapters[adapter], part)
         if sizes["input_dim"] != channels:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from PIL import Image
 
 from gsencoder.core.device import choose_device, enough_memory
-from gsencoder.core.errors import InputError, SceneWarning, about, listed
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix, listed
 from gsencoder.core.pretrained import (
     ANY,
     digest_files,
@@ -295,7 +295,7 @@ class CaptionedRegions:
         self.kinds = tuple(sorted(used))
         self.captions = (*([""] if rest else []), *self.kinds)
         self.mean = words.mean
-        with about(f"{WHAT}: captions"):
+        with error_prefix(f"{WHAT}: captions"):
             vectors = words.encode(self.kinds)
         if rest:
             direction = words.mean.astype(np.float64)

@@ -19,7 +19,7 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
 from gsencoder.core.device import choose_device
-from gsencoder.core.errors import InputError, SceneWarning, about, listed
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix, listed
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import (
     digest_files,
@@ -346,7 +346,7 @@ def _class_vectors(synonyms: Sequence[Sequence[str]], words: Words) -> Float32[n
     phrases = list(dict.fromkeys(phrase for each in synonyms for phrase in each))
     if not phrases:
         raise InputError(f"{WHAT}: none of its classes is a kind of thing; check teacher.nothing")
-    with about(f"{WHAT}: names of its classes"):
+    with error_prefix(f"{WHAT}: names of its classes"):
         vector_of = dict(zip(phrases, words.encode(phrases).astype(np.float64), strict=True))
     mean = words.mean.astype(np.float64)
     table = np.stack([np.mean([vector_of[phrase] for phrase in each], axis=0) if each else mean for each in synonyms])

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.archive import open_archive, read_npz, write_archive
-from gsencoder.core.errors import InputError, SceneWarning, about, readable
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix, readable
 from gsencoder.core.files import open_foreign
 from gsencoder.types import FeatureSpace
 
@@ -120,7 +120,7 @@ def embed_in_templates(
     """The mean of a phrase's vectors over templates, of unit length."""
     total = np.zeros((len(phrases), tower.channels))
     for template in templates:
-        with about(f"text tower {tower.name}"):
+        with error_prefix(f"text tower {tower.name}"):
             vectors = tower.embed([template.replace(SLOT, check_phrase(phrase)) for phrase in phrases])
         if not np.isfinite(vectors).all():
             raise InputError(f"text tower {tower.name}: its vectors are not finite; check the model")

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, error_prefix
 from gsencoder.core.pretrained import MODELS_VARIABLE, SENTENCE_ENCODER
 from gsencoder.text.models import OnnxTextConfig, OnnxTower, TransformersTextConfig, TransformersTower
 from gsencoder.text.table import (
@@ -126,7 +126,9 @@ def make_vocabulary(
         lower=tower.lower,
     )
     space = FeatureSpace(name=tower.identity, channels=tower.channels, text_encoder=tower.identity)
-    with about(f"text tower {tower.name} cannot embed everyday words, so its tokenizer may be that of another model"):
+    with error_prefix(
+        f"text tower {tower.name} cannot embed everyday words, so its tokenizer may be that of another model"
+    ):
         vectors = cached_vectors(
             record.identity, templates, REFERENCE_NOUNS, lambda missing: embed_in_templates(tower, missing, templates)
         )

@@ -25,11 +25,11 @@ from torch.utils.data import DataLoader, Dataset
 
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.device import autocast_dtype, to_device
-from gsencoder.core.errors import InputError, advised
+from gsencoder.core.errors import InputError, error_hint
 from gsencoder.core.files import plain
 from gsencoder.core.logs import Log
 from gsencoder.core.process import Precision, ProcessRank, Track, defer_signals, stop_of, untracked
-from gsencoder.core.settings import check_limits, first_difference, option
+from gsencoder.core.settings import CheckedConfig, first_difference, option
 from gsencoder.core.threads import available_cores, threads_of_torch
 from gsencoder.train import distributed
 from gsencoder.train.distributed import (
@@ -49,7 +49,7 @@ CLIP = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrainerConfig:
+class TrainerConfig(CheckedConfig):
     """Settings of the training loop."""
 
     steps: int = option(2000, "optimizer steps", ge=1)
@@ -75,9 +75,6 @@ class TrainerConfig:
     log_every: int = option(10, "steps per row of the log, over which losses are averaged", ge=1)
     validate_every: int = option(500, "steps between validations; 0 = only at the end", ge=0)
     checkpoint_every: float = option(300.0, "seconds between checkpoints", ge=0)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
     def samples_per_step(self, processes: int) -> int:
         """The number of samples of one optimizer step over all processes."""
@@ -240,7 +237,7 @@ def load_checkpoint(
     path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, settings: dict[str, Any]
 ) -> TrainingState:
     """Restores model and optimizer from a checkpoint; of a run with other settings the first that differs is named."""
-    with advised(_advice(path)), open_archive(path) as file:
+    with error_hint(_advice(path)), open_archive(path) as file:
         stored_settings = file.value("settings", dict)
         if stored_settings != settings:
             raise InputError(f"{path}: {_describe_difference(stored_settings, settings)}")
@@ -275,7 +272,7 @@ def check_same_teachers(path: Path, teachers: Sequence[str]) -> None:
     """Checks that a checkpoint, if there is one, is of a run with these teachers in this order, which is known before
     anything is prepared for them."""
     if path.is_file():
-        with advised(_advice(path)), open_archive(path) as file:
+        with error_hint(_advice(path)), open_archive(path) as file:
             stored = file.value("settings", dict)
             if stored.get("teachers") != list(teachers):
                 raise InputError(f"{path}: {_describe_difference(stored, {'teachers': list(teachers)})}")

@@ -27,10 +27,10 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from gsencoder.core.archive import open_archive, write_archive
-from gsencoder.core.errors import InputError, advised
+from gsencoder.core.errors import InputError, error_hint
 from gsencoder.core.files import plain, read_foreign, write_json
 from gsencoder.core.process import ProcessRank, Track, untracked
-from gsencoder.core.settings import check_limits, first_difference, option
+from gsencoder.core.settings import CheckedConfig, first_difference, option
 from gsencoder.data.scene_arrays import bank_parts, read_bank
 from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.basis import to_coordinates
@@ -142,7 +142,7 @@ def open_memory_scene(folder: Path) -> MemoryScene:
 
 
 def _advice(folder: Path) -> AbstractContextManager[None]:
-    return advised(f"give resume=false, or remove {folder}, to prepare the scene again")
+    return error_hint(f"give resume=false, or remove {folder}, to prepare the scene again")
 
 
 def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
@@ -163,7 +163,7 @@ def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
 
 def open_raw_sample(folder: Path) -> RawSample:
     """The raw features that were stored beside the bank."""
-    with advised(f"remove {folder} to prepare the scene again"), open_archive(folder / SAMPLE_FILE) as file:
+    with error_hint(f"remove {folder} to prepare the scene again"), open_archive(folder / SAMPLE_FILE) as file:
         return RawSample(features=file.array("features", "float32", ("n", "D")), total=file.value("total", int))
 
 
@@ -226,7 +226,7 @@ ROWS = 2000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MemoryConfig:
+class MemoryConfig(CheckedConfig):
     """Queries, attention and loss of a memory."""
 
     channels: int = option(16, "channels s of a Gaussian's query for each teacher", ge=1, le=1024)
@@ -248,9 +248,6 @@ class MemoryConfig:
         ge=0,
     )
     min_alpha: float = option(0.5, "smallest opacity of a row", gt=0, le=1)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 class MemoryBatch(NamedTuple):

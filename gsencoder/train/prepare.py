@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.errors import InputError, advised, listed, readable
+from gsencoder.core.errors import InputError, error_hint, listed, readable
 from gsencoder.core.files import locked, read_foreign
 from gsencoder.core.process import ProcessRank, Track
 from gsencoder.core.settings import check_limits, first_difference, option
@@ -256,7 +256,7 @@ class PreparedDataset:
         compared with those stored in it, and None = open an existing dataset with any settings."""
         self.folder, path = folder, folder / SPACE_FILE
         self.settings: dict[str, Any] = json.loads(json.dumps(settings, default=str)) if settings is not None else {}
-        with advised("give another folder as prepared="):
+        with error_hint("give another folder as prepared="):
             if not path.is_file():
                 if settings is None:
                     raise InputError(f"{folder}: expected prepared scenes, found no {SPACE_FILE}")
@@ -287,7 +287,7 @@ class PreparedDataset:
 
     def load_kinds(self) -> tuple[str, ...]:
         """Loads the names of the things that the teacher tells apart; none for a teacher without names."""
-        with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
+        with error_hint("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
             kinds = file.value("kinds", list)
             if not all(isinstance(kind, str) for kind in kinds):
                 raise InputError("expected names as the kinds in the header")
@@ -295,7 +295,7 @@ class PreparedDataset:
 
     def load_space(self) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
         """Loads the output space, and for a coded teacher the vectors of its codes in standard units, else None."""
-        with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
+        with error_hint("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
             outputs = read_output_space(file)
             codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
         return outputs, codebook
@@ -314,7 +314,7 @@ class PreparedDataset:
         path = self.scene_path(source.name)
         if not path.is_file():
             return False
-        with advised("remove the file to prepare the scene again"), open_archive(path) as file:
+        with error_hint("remove the file to prepare the scene again"), open_archive(path) as file:
             stored_source = file.value("source", str)
             files = file.value("source_files", str)
             if (got := stored_precision(file)) != self.precision:
@@ -389,7 +389,7 @@ class PreparedDataset:
         """The codebook of the classes; None if the targets of these scenes have been counted."""
         scenes, path = self.scenes(names), self.folder / CLASS_BALANCE_FILE
         if path.is_file():
-            with advised("remove the file to count targets again"), open_archive(path) as file:
+            with error_hint("remove the file to count targets again"), open_archive(path) as file:
                 if {scene.name for scene in scenes} <= set(file.value("scenes", list)):
                     return None
         _, codebook = self.load_space()
@@ -402,7 +402,7 @@ class PreparedDataset:
         """Loads the target classes and their frequencies, as stored by `count_classes`."""
         channels = self.load_space()[0].channels
         path = self.folder / CLASS_BALANCE_FILE
-        with advised("remove the file to count targets again"), open_archive(path) as file:
+        with error_hint("remove the file to count targets again"), open_archive(path) as file:
             codebook = file.array("codebook", "float32", ("C", channels))
             counts = file.array("counts", "float64", ("C",))
             if not len(counts) or not (counts >= 0).all():

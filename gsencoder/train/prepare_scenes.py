@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError, SceneWarning, about, listed
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.core.settings import option
@@ -117,13 +117,13 @@ class SceneReader:
 
     def with_views(self, name: str, path: Path) -> tuple[Scene, Teacher]:
         """A scene with views, which is enough for maps, and the teacher of this name."""
-        with about(path):
+        with error_prefix(path):
             scene = self.load(path)
             return scene, self.teacher(name, scene)
 
     def weights_of_teachers(self, path: Path) -> dict[str, str]:
         """The digests of the weights of the teachers that a scene has, by their names."""
-        with about(path):
+        with error_prefix(path):
             scene, weights = self.load(path), dict[str, str]()
             for name in self.config.teachers_by_name:
                 try:
@@ -230,7 +230,7 @@ def prepare_scenes(
 @contextmanager
 def _about_teacher(config: SourceConfig, name: str) -> Iterator[None]:
     """Names a teacher, where there are several, and its options as they are typed in errors of the block."""
-    with about(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
+    with error_prefix(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
         yield
 
 
@@ -282,7 +282,7 @@ def _prepare_scene(
 ) -> None:
     """Prepares a scene, which is trained on or held out, for some teachers; with `optional` those are left out for
     which it lacks something."""
-    with about(path):
+    with error_prefix(path):
         scene, teachers = reader.load(path), dict[str, Teacher]()
         for name in names:
             try:

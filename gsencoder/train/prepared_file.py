@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Float16, Float32, Float64, Int32, Int64
 
 from gsencoder.core.archive import Archive, MappedArrays, open_archive, write_archive
 from gsencoder.core.arrays import round_columns
-from gsencoder.core.errors import InputError, about, advised
+from gsencoder.core.errors import InputError, error_hint, error_prefix
 from gsencoder.data.scene_arrays import camera_arrays, read_cameras
 from gsencoder.fusion.errors import BINS, ProjectionSums
 from gsencoder.models.output_space import OutputSpace
@@ -225,7 +225,7 @@ class PreparedScene:
     @contextmanager
     def _error_context(self) -> Iterator[None]:
         """Adds the path and the remedy to errors of reading."""
-        with about(self.path), advised("remove the file to prepare the scene again"):
+        with error_prefix(self.path), error_hint("remove the file to prepare the scene again"):
             yield
 
     def projections(self) -> ProjectionSums | None:

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from gsencoder.core.errors import InputError, about
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.errors import InputError, error_prefix
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, Plan, join_plans
 from gsencoder.train.losses import TERMS, LossConfig, RenderRows, TeacherTargets
@@ -35,7 +35,7 @@ _CANDIDATES_PER_GAUSSIAN = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SamplingConfig:
+class SamplingConfig(CheckedConfig):
     """Selection of the Gaussians and views of a sample (SplatDistill sec. 3.3, "view-dependent selection")."""
 
     views: int = option(4, "number of target views of a sample, in which the render loss is computed", ge=1)
@@ -48,9 +48,6 @@ class SamplingConfig:
     rare_centers: float = option(
         0.8, "share of crops whose center is drawn evenly over target classes instead of over Gaussians", ge=0, le=1
     )
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras) -> Bool[np.ndarray, " N"]:
@@ -455,7 +452,7 @@ class SampleDataset(Dataset[Sample]):
         size = crop_size(self.recipe.sampling, step_rng)
         scene_index = int(order[position])
         scene = self.scenes[scene_index]
-        with about(f"scene {scene.name}"):
+        with error_prefix(f"scene {scene.name}"):
             return make_sample(scene, self._target_codes(scene_index), self.recipe, size, rng)
 
     def _target_codes(self, scene_index: int) -> Codes:

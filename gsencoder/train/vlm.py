@@ -34,23 +34,20 @@ from gsencoder.core.pretrained import (
     read_config,
     weight_files,
 )
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 
 WHAT = "tune"
 SERVED_FOLDER = "served"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AdapterConfig:
+class AdapterConfig(CheckedConfig):
     """Low-rank adapters (LoRA, Hu et al. 2021) of all linear layers of the language model: W x becomes W x + (alpha /
     rank) · B A x."""
 
     rank: int = option(16, "rank of A and B", ge=1, le=4096)
     alpha: float = option(32.0, "scale of the adapters, divided by the rank", gt=0)
     dropout: float = option(0.05, "share of an adapter's inputs that is dropped in training", ge=0, lt=1)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 def check_peft() -> None:

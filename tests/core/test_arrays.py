@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.archive import RowFile
-from gsencoder.core.arrays import even_indices, first_repeated, rise_within
+from gsencoder.core.arrays import even_indices, first_repeated, is_strictly_increasing
 from gsencoder.core.errors import InputError
 
 
@@ -43,7 +43,7 @@ def test_the_value_and_both_places_are_given() -> None:
     ],
 )
 def test_rows_rise_strictly_from_0_to_less_than_their_count(rows: list[int], count: int, expected: bool) -> None:
-    assert rise_within(np.array(rows, np.int32), count) is expected
+    assert is_strictly_increasing(np.array(rows, np.int32), count) is expected
 
 
 @pytest.mark.parametrize("sizes", [[], [0, 5, 0, 1, 7]])

@@ -12,7 +12,7 @@ from gsencoder.app.options import SharedScenesConfig, settings, typed
 from gsencoder.app.run import Run
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.budget import MEGABYTE
-from gsencoder.core.errors import InputError, SceneWarning, about, counted
+from gsencoder.core.errors import InputError, SceneWarning, counted, error_prefix
 from gsencoder.core.pretrained import digest_files
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.core.settings import option
@@ -102,7 +102,7 @@ def run(config: EncodeCommandConfig, run: Run) -> None:
                 # Before they are cut, which takes a while where there are thousands.
                 least = counted(math.ceil(count / chunk), "chunk")
                 run.print(f"{out}: {count:,} Gaussians in {least} or more (encode.chunk={chunk})")
-            with about(scene.name):
+            with error_prefix(scene.name):
                 spaces, lines = _encode_into(folder, scene, encoder, config, made_with, run)
             if heads is not None:
                 others = [space for space in encoder.spaces.values() if space not in spaces]
@@ -217,7 +217,7 @@ def _basis_figures(
     """The figures of a basis, of this scene with `basis_views`, else of the scenes held out of the training."""
     figures = basis_figures(features.basis, features.features.shape[1])
     if config.basis_views and features.basis is not None:
-        with run.step("basis"), about(f"teacher {name}") if len(encoder.spaces) > 1 else nullcontext():
+        with run.step("basis"), error_prefix(f"teacher {name}") if len(encoder.spaces) > 1 else nullcontext():
             return figures | _figures_of_scene(scene, name, features.basis, encoder, config.basis_views)
     stored = encoder.made_by.get("basis", {})
     stored = stored.get(name, stored)

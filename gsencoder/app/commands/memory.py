@@ -12,7 +12,7 @@ import torch
 from gsencoder.app.inputs import load_fusable
 from gsencoder.app.options import CommonConfig, settings
 from gsencoder.app.run import Run
-from gsencoder.core.errors import InputError, about, advised, counted
+from gsencoder.core.errors import InputError, counted, error_hint, error_prefix
 from gsencoder.core.files import write_picture
 from gsencoder.core.logs import LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
@@ -151,7 +151,7 @@ def run(config: MemoryCommandConfig, run: Run) -> None:
             from gsencoder.infer.memory_pictures import attention_pictures, component_scatter
 
             blend = config.prepare.fusion.blend
-            with run.step("pictures"), advised("give pictures=0 to write the memory without pictures"):
+            with run.step("pictures"), error_hint("give pictures=0 to write the memory without pictures"):
                 for name, memory in memories.items():
                     scatter = component_scatter(memory.bank, open_raw_sample(work / name), umap=config.umap)
                     write_picture(folder / f"components.{name}.png", scatter)
@@ -177,7 +177,7 @@ def _prepare(
     with run.step("encode"):
         predicted = predicted_features(scene, config) if config.weights else {}
     for name, teacher_config in config.teachers_by_name.items():
-        with about(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
+        with error_prefix(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
             with run.step("teacher"):
                 teacher = build_teacher(teacher_config, scene, words.get(name))
             spaces[name] = teacher.space

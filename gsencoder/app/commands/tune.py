@@ -17,7 +17,7 @@ from gsencoder.app.commands.ask import AskingConfig, asker_of
 from gsencoder.app.output import prepared_folder
 from gsencoder.app.run import Run
 from gsencoder.app.scenes import shown_scene
-from gsencoder.core.errors import BusyError, InputError, SceneWarning, about, counted, listed
+from gsencoder.core.errors import BusyError, InputError, SceneWarning, counted, error_prefix, listed
 from gsencoder.core.files import lock_folder, plain
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE, read_log
 from gsencoder.core.pretrained import find_file
@@ -232,7 +232,7 @@ def prepare_prompts(
         for each, key in track(list(zip(questions, keys, strict=True)), "preparing prompts"):
             if key in store.prompts:
                 continue
-            with about(f"question {each.id}"):
+            with error_prefix(f"question {each.id}"):
                 if asker is None or scene != each.scene:
                     scene = each.scene
                     asker, features = _asker(folders[scene], str(photos.get(scene, "")), config)
@@ -266,7 +266,7 @@ def _asker(folder: Path, photos: str, config: TuneCommandConfig) -> tuple[Asker,
     scene = shown_scene(folder, photos, config.data)
     features = None
     if config.tokens:
-        with about(f"tokens={config.tokens}"):
+        with error_prefix(f"tokens={config.tokens}"):
             features = select_features(scene, config.tokens)[1]
     return asker_of(config, VlmConfig(image_side=config.image_side), scene, folder), features
 

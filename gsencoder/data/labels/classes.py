@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Int32, Int64
 
 from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix
 from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.data.labels.files import read_checked_text, read_rows
 
@@ -104,7 +104,7 @@ def read_class_list(path: Path) -> ClassTable:
     """The classes of a text file with one name a line, such as ScanNet++'s top100.txt; ids count the lines from 0."""
     lines = [line.strip() for line in read_checked_text(path, max_bytes=MAX_BYTES).splitlines()]
     names = tuple(line for line in lines if line)
-    with about(path):
+    with error_prefix(path):
         return ClassTable(names=names, ids=tuple(range(len(names))))
 
 
@@ -240,7 +240,7 @@ def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
             _id(row["id"], where, "id")
             if not row["name"].strip():
                 raise InputError(f"{where}: name is empty")
-        with about(path):
+        with error_prefix(path):
             table = _table(row for row, _ in rows)
     if instances and 0 in table.ids:
         raise InputError(

@@ -16,7 +16,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, error_prefix
 from gsencoder.core.threads import ahead, kernel
 from gsencoder.types import Views
 from gsencoder.types.scene import pixel_centers, unproject_points
@@ -276,7 +276,7 @@ def depth_samples(views: Views, *, voxel: float) -> tuple[SurfaceSamples, list[s
 
     empty = []
     for name, samples in zip(views.names, ahead(samples_of, range(len(views))), strict=True):
-        with about(f"view {name!r}"):
+        with error_prefix(f"view {name!r}"):
             grid.add(*samples)
         if not len(samples[0]):
             empty.append(name)

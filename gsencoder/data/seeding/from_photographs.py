@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.data.seeding.matches import overlaps, triangulate, typical_distance
 from gsencoder.data.seeding.points import seed_from_points
@@ -157,7 +157,7 @@ CELL = 1 / 40  # Side of the cells in which coverage is counted, as a share of t
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DenseConfig:
+class DenseConfig(CheckedConfig):
     """When seeds are added, and how many."""
 
     enough: float = option(
@@ -165,9 +165,6 @@ class DenseConfig:
     )
     spacing: float = option(6.0, "distance of seeds in pixels of a typical photograph", ge=0.1, lt=math.inf)
     samples: int = option(3, "pixels that must agree on a seed, from all photographs", ge=1)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsencoder.core.errors import InputError, SceneWarning, about, counted
+from gsencoder.core.errors import InputError, SceneWarning, counted, error_prefix
 from gsencoder.core.settings import option
 from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.evaluate.benchmarks.localization import is_seen
@@ -62,7 +62,7 @@ Asked = tuple[AskedWord, ...]
 class AbsentBenchmark(Benchmark[Asked]):
     def __init__(self, protocol: AbsentProtocol, evaluation: Evaluation) -> None:
         self.protocol, self.evaluation = protocol, evaluation
-        with about("protocol.vocabulary"):
+        with error_prefix("protocol.vocabulary"):
             check_known(evaluation.words, protocol.vocabulary)
         self.vocabulary = protocol.vocabulary or names_of(evaluation.scenes())
 

@@ -42,7 +42,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.archive import read_npz
-from gsencoder.core.errors import InputError, about, counted
+from gsencoder.core.errors import InputError, counted, error_prefix
 from gsencoder.core.files import write_bytes
 from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import (
@@ -112,7 +112,7 @@ class InstancesBenchmark(Benchmark[None]):
         masks = predict_instances(
             scene, points, features, classes, self.evaluation.words, self.protocol, self.evaluation.localization
         )
-        with about(f"scene {scene.name}"):
+        with error_prefix(f"scene {scene.name}"):
             ids = instance_ids(points.objects, points.names, classes.id_of)
         for name in (LABELS, PREDICTIONS):
             self.evaluation.file(name).mkdir(exist_ok=True)
@@ -525,7 +525,7 @@ def match_instance_files(
         else:
             ids = instance_ids_of_scan(files.labels, raw_ids, classes)
         masks = read_instance_prediction(files.prediction, num_vertices=len(ids))
-        with about(files.prediction):
+        with error_prefix(files.prediction):
             yield match_instances(ids, masks, classes, class_agnostic=class_agnostic)
 
 
@@ -563,7 +563,7 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
         first[mask_path] = number
         labels.append(_label(words[1], where))
         scores.append(_score(words[2], where))
-        with about(where):
+        with error_prefix(where):
             mask = read_mask(mask_path)
         if len(mask) != num_vertices:
             raise InputError(
@@ -603,7 +603,7 @@ def _read_npz(path: Path, num_vertices: int) -> InstancePrediction:
             f"{path}: {masks.shape[1]} masks, {len(labels)} pred_classes and {len(scores)} pred_scores; expected as "
             "many of each"
         )
-    with about(path):
+    with error_prefix(path):
         return prediction_of_masks(
             path.stem, np.ascontiguousarray(masks.T), labels.tolist(), scores.tolist(), num_vertices=num_vertices
         )

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from gsencoder.core.errors import InputError, SceneWarning, advised, counted
-from gsencoder.core.settings import check_limits
+from gsencoder.core.errors import InputError, SceneWarning, counted, error_hint
+from gsencoder.core.settings import CheckedConfig
 from gsencoder.data.labels.classes import ClassTable, ids_of_raw_names, is_scannetpp_map, load_classes
 from gsencoder.data.labels.scans import find_labels
 from gsencoder.data.seeding.seed import SeedConfig
@@ -90,11 +90,8 @@ class Benchmark(Generic[Result]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Protocol:
+class Protocol(CheckedConfig):
     """Settings of one protocol. Subclasses have a field `name: Literal["…"]`."""
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
     def start(self, evaluation: Evaluation) -> Benchmark[Any]:
         raise NotImplementedError
@@ -173,6 +170,6 @@ def predicted_classes(evaluation: Evaluation, *, instances: bool = False) -> Pre
         name_of, ids = table.name_of, ids_of_raw_names(evaluation.label_map, evaluation.classes)
         class_of = {raw: name_of[number] for raw, number in ids.items() if number in name_of}
         labeled = list(ids) if is_scannetpp_map(evaluation.label_map) else None
-    with advised("give words that know all classes, or the classes that they know as classes=FILE"):
+    with error_hint("give words that know all classes, or the classes that they know as classes=FILE"):
         check_known(evaluation.words, table.names)
     return PredictedClasses(table=table, class_of=class_of, labeled=labeled)

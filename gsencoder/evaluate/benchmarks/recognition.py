@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError, about, counted
+from gsencoder.core.errors import InputError, counted, error_prefix
 from gsencoder.core.files import write_json
 from gsencoder.data.labels.classes import load_classes, write_classes
 from gsencoder.data.labels.files import (
@@ -138,7 +138,7 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
     true_names = read_recognition_labels(labels)
     names = load_classes(options.classes).names if options.classes else sorted(set(true_names.values()))
     ranked = read_recognition_predictions(predictions)
-    with about(predictions):
+    with error_prefix(predictions):
         recognized = recognize(ranked, true_names, names, allow_missing=options.allow_missing)
     if not recognized:
         raise InputError(f"{labels}: nothing to score: it holds no object of the {len(names)} classes")

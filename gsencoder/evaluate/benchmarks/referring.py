@@ -33,7 +33,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.errors import InputError, SceneWarning, about, counted, listed
+from gsencoder.core.errors import InputError, SceneWarning, counted, error_prefix, listed
 from gsencoder.core.files import write_json
 from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import COLUMNS, ids_of_names, read_label_map, scannet_classes
@@ -289,7 +289,7 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
         label_map=Path(options.label_map) if options.label_map else None,
         scans=Path(options.scans) if options.scans else None,
     )
-    with about(predictions):
+    with error_prefix(predictions):
         sentences = compare_boxes(boxes, expressions, allow_missing=options.allow_missing)
     if not sentences:
         raise InputError(f"{labels}: nothing to score: it holds no sentence about an object with a box")

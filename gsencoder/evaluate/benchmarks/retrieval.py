@@ -28,7 +28,7 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.core.archive import read_npz
 from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError, SceneWarning, about, advised, counted, listed
+from gsencoder.core.errors import InputError, SceneWarning, counted, error_hint, error_prefix, listed
 from gsencoder.core.files import write_bytes, write_json
 from gsencoder.core.settings import option
 from gsencoder.data.labels.files import (
@@ -159,7 +159,7 @@ class RetrievalBenchmark(Benchmark[Retrieved]):
                 f"{len(others):,}"
             )
         texts, words = [*own, *others], evaluation.words
-        with advised("sentences need the tower that made the words (text=)"):
+        with error_hint("sentences need the tower that made the words (text=)"):
             check_known(words, texts)
         for scene in evaluation.scenes():
             views_of(scene, self._about(scene))
@@ -375,7 +375,7 @@ def read_scored_pairs(path: Path) -> ScoredPairs:
     arrays = read_npz(path, {"queries": ("U", 1), "scores": ("f", 2)}, {"distractor_scores": ("f", 2)})
     queries = tuple(arrays["queries"].tolist())
     others = arrays.get("distractor_scores", np.zeros((0, len(queries))))
-    with about(path):
+    with error_prefix(path):
         return ScoredPairs(
             queries=queries, scores=arrays["scores"].astype(np.float64), distractors=others.astype(np.float64)
         )

@@ -30,7 +30,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Int32, Int64
 
-from gsencoder.core.errors import InputError, about, counted
+from gsencoder.core.errors import InputError, counted, error_prefix
 from gsencoder.data.labels.classes import (
     IDS_PER_CLASS,
     ClassTable,
@@ -287,7 +287,7 @@ def count_label_files(
             _class_ids(files.labels, classes) if raw_ids is None else class_ids_of_scan(files.labels, raw_ids, classes)
         )
         predicted = _class_ids(files.prediction, classes)
-        with about(files.prediction):
+        with error_prefix(files.prediction):
             yield count_labels(files.scene, true_ids, predicted, classes)
 
 

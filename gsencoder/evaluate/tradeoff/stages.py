@@ -18,7 +18,7 @@ import torch
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import picture_bytes
-from gsencoder.core.settings import Knob, check_limits, exact_settings, option
+from gsencoder.core.settings import CheckedConfig, Knob, exact_settings, option
 from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
@@ -280,7 +280,7 @@ Graph = Literal["none", "float32", "float16", "int8_weights", "int8_dynamic"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EncoderSettings:
+class EncoderSettings(CheckedConfig):
     """Which encoder runs, and how; 0 = as in its training.
 
     Attributes:
@@ -294,9 +294,6 @@ class EncoderSettings:
     voxel: float = option(0.0, "edge of the token grid, metres", ge=0)
     patch: int = option(0, "largest number of tokens of a patch", ge=0)
     encode: EncodeConfig = field(default_factory=EncodeConfig)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 ENCODER_KNOBS = (

@@ -14,9 +14,9 @@ from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import (
+    CheckedConfig,
     Knob,
     changed_knobs,
-    check_limits,
     describe_values,
     option,
     read_value,
@@ -28,7 +28,7 @@ from gsencoder.evaluate.tradeoff.stages import HIGHER_IS_BETTER, Score, Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SweepConfig:
+class SweepConfig(CheckedConfig):
     """Which values are tried, and how often each is timed."""
 
     knobs: tuple[str, ...] = option((), "knobs that are tried; empty = all", names=True)
@@ -40,18 +40,12 @@ class SweepConfig:
     grid: bool = option(False, "try all combinations instead of changing one knob at a time")
     rounds: int = option(3, "timed runs of each setting, of which the median is reported", ge=1)
 
-    def __post_init__(self) -> None:
-        check_limits(self)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HalvingConfig:
+class HalvingConfig(CheckedConfig):
     """How the knobs that matter are changed together."""
 
     settings: int = option(0, "combinations of the knobs that matter that are tried together; 0 = none", ge=0)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 Phase = Literal["base", "one at a time", "grid", "joint"]

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.draw import Picture
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, spacing_of
@@ -169,14 +169,11 @@ class Question:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AskConfig:
+class AskConfig(CheckedConfig):
     """How a question becomes a prompt."""
 
     boxes: int = option(3, "boxes of each word that are looked at, best first", ge=1)
     marks: bool | None = option(None, "numbered marks on what was found; left out: for ground and caption")
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

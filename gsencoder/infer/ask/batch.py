@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.core.errors import InputError, SceneWarning, WriteError, about
+from gsencoder.core.errors import InputError, SceneWarning, WriteError, error_prefix
 from gsencoder.core.files import plain, sealed, unsealed, write_bytes, write_json
 from gsencoder.core.process import Clock, Track, untracked
 from gsencoder.data.labels.expressions import wrapped_caption
@@ -113,7 +113,7 @@ def ask_questions(
         folder.mkdir()
         label = f"question {each.id[:40]}"
         try:
-            with about(label), warnings_about(label) as messages:
+            with error_prefix(label), warnings_about(label) as messages:
                 row = ask_question(each.question, asker, server, folder, clock)
         except (ServerError, WriteError) as error:
             raise InputError(f"{error}; {len(done)} of {len(questions)} answers are kept in {file}") from error

@@ -8,7 +8,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from gsencoder.core.errors import InputError, SceneWarning, about, counted, listed, readable
+from gsencoder.core.errors import InputError, SceneWarning, counted, error_prefix, listed, readable
 from gsencoder.core.files import MODEL_BYTES, check_written, open_foreign, read_foreign
 from gsencoder.data.labels.expressions import Expression, read_scanrefer
 from gsencoder.data.labels.files import (
@@ -54,12 +54,12 @@ class BatchQuestion:
 def read_questions(path: Path, task: Task = "answer") -> tuple[BatchQuestion, ...]:
     """Reads lines such as {"id": "7", "question": "What is on the table?", "query": "table"}; id, task, query and aabb
     may be left out."""
-    with about("questions"):
+    with error_prefix("questions"):
         lines = read_checked_text(path, max_bytes=MAX_FILE_BYTES).split("\n")
     questions: dict[str, BatchQuestion] = {}
     for number, line in enumerate(lines, start=1):
         if line.strip():
-            with about(f"{path}: line {number}"):
+            with error_prefix(f"{path}: line {number}"):
                 question = _parse_line(line, str(number), task)
                 if question.id in questions:
                     raise InputError(f"id {question.id[:40]!r} comes twice")

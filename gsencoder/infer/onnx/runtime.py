@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.arrays import round_columns
-from gsencoder.core.errors import InputError, SceneWarning, about, readable
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix, readable
 from gsencoder.core.files import MODEL_BYTES, read_foreign
 from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device, Precision, Stored
@@ -287,10 +287,10 @@ class OnnxNetwork:
         self.name = "the model" if isinstance(file, bytes) else str(find_file(str(file), "weights"))
         with readable(self.name):
             model = file if isinstance(file, bytes) else read_foreign(self.name, MODEL_BYTES)
-        with about(self.name):
+        with error_prefix(self.name):
             summed = check_sum(model)
         self.session = open_session(model, self.name, device, threads)
-        with about(self.name):
+        with error_prefix(self.name):
             self.header: EncoderHeader = from_metadata(self.session.get_modelmeta().custom_metadata_map)
             types = {"voxel": "tensor(double)", "starts": "tensor(int64)"}
             expected = {f"{name}: {types.get(name, 'tensor(float)')}" for name in (*FIELDS, *SETTINGS)}
