@@ -53,7 +53,7 @@ test: setup      ## all tests; those that need real data look for it in GSENCODE
 test-fast: setup ## the tests that take a second at most
 	$(BIN)/python -m pytest -q -n $(PROCESSES) --dist worksteal -m "not alone and not slow" $(SLOW:%=--ignore=%)
 
-stability: setup ## searches for cases that break a promise of docs/numerics.md, for some minutes
+stability: setup ## searches for cases that exceed a bound of docs/numerics.md, for some minutes
 	GSENCODER_STABILITY_EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q -n $(PROCESSES) tests/stability
 
 check: lint test ## what continuous integration runs

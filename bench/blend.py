@@ -46,7 +46,6 @@ def main() -> None:
     options = parser.parse_args()
     scene = load_scene(options.scene)
     gaussians = seed(scene, SeedConfig(voxel=options.voxel))
-    assert scene.views is not None
     cameras = enlarged(scene.views.cameras, 2)
     size = f"{cameras.widths[options.view]}×{cameras.heights[options.view]}"
     print(f"{len(gaussians):,} Gaussians, view {options.view} at {size}, {torch.get_num_threads()} threads")

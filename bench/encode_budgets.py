@@ -39,7 +39,6 @@ def main() -> None:
     config, lines = EncodeConfig(chunk=given.chunk), []
     for path in given.scenes:
         scene = with_gaussians(load_scene(path), SeedConfig())
-        assert scene.gaussians is not None
         gaussians, unit = scene.gaussians, unit_of(scene, encoder.voxel)
         for precision in encoder.precisions("auto"):
             few = gaussians.select(np.arange(min(1000, len(gaussians))))

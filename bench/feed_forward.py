@@ -41,7 +41,6 @@ def maps_of(scenes: list[tuple[Scene, Teacher]]) -> MapStream:
 
     def stream() -> Iterator[tuple[int, FeatureMap]]:
         for scene, teacher in scenes:
-            assert scene.views is not None
             for view in range(len(scene.views)):
                 yield view, teacher.feature_map(scene.views, view)
 
@@ -64,7 +63,6 @@ def main() -> None:
     results, seconds = defaultdict(list), defaultdict(list)
     for path in arguments.rooms:
         scene = with_gaussians(load_scene(path), SeedConfig())
-        assert scene.gaussians is not None
         teacher = build_teacher(labels, scene, words)
         assert isinstance(teacher, LabelsTeacher)
         truth = fuse(scene, teacher).features

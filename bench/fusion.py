@@ -30,8 +30,6 @@ def main() -> None:
     add_json_option(parser)
     options = parser.parse_args()
     scene = with_gaussians(load_scene(options.scene), SeedConfig())
-    assert scene.gaussians is not None
-    assert scene.views is not None
     teacher = build_teacher(LabelsConfig(), scene, words_of(LabelsConfig(), TableTextConfig()))
     print(f"{len(scene.gaussians):,} Gaussians, {len(scene.views)} views")
     runs = []

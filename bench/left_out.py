@@ -43,8 +43,6 @@ SPLAT = "splat.ply"
 def write_views(scene: Scene, rows: Sequence[int], folder: Path) -> None:
     """Writes some views of a scene as transforms.json with undistorted photographs and depth."""
     views = scene.views
-    assert views is not None
-    assert views.images is not None
     (folder / "images").mkdir(parents=True)
     frames = []
     for row in rows:
@@ -74,7 +72,6 @@ def rendered_cosines(
 ) -> tuple[float, float, float]:
     """Mean raw and centered cosine of rendered features with maps, and the share of the cells that are covered."""
     views = scene.views
-    assert views is not None
     raw, centered, covered, cells = 0.0, 0.0, 0, 0
     coordinates = features.features if features.basis is not None else features.features - features.mean
     values = torch.from_numpy(coordinates * features.seen[:, None])
@@ -99,14 +96,12 @@ def cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def write(arguments: argparse.Namespace) -> None:
     scene = load_scene(arguments.scene, splat=str(Path(arguments.splat).resolve()) if arguments.splat else None)
-    assert scene.views is not None
     rows = np.arange(len(scene.views))
     out = rows % arguments.every == arguments.every // 2
     write_views(scene, rows[~out].tolist(), arguments.out / "kept")
     write_views(scene, rows[out].tolist(), arguments.out / "left_out")
     kept = load_scene(arguments.out / "kept")
     gaussians = scene.gaussians if arguments.splat else with_gaussians(kept).gaussians
-    assert gaussians is not None
     save_splat(arguments.out / "kept" / SPLAT, gaussians)
     print(f"{arguments.out}: {(~out).sum()} views kept, {out.sum()} left out, {len(gaussians):,} Gaussians")
 
@@ -115,8 +110,6 @@ def score(arguments: argparse.Namespace) -> None:
     config = compose("fuse", FuseCommandConfig, ["-", f"teacher={arguments.teacher}"])
     kept = load_scene(arguments.out / "kept", splat=SPLAT)
     left_out = load_scene(arguments.out / "left_out")
-    assert kept.gaussians is not None
-    assert left_out.views is not None
     teacher = build_teacher(config.teacher, kept, words_of(config.teacher, config.text))
     maps = [teacher.feature_map(left_out.views, view) for view in range(len(left_out.views))]
     fused = fuse(kept, teacher, FuseConfig()).features

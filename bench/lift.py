@@ -26,14 +26,12 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
 from json_option import add_json_option, write_figures
 
-from gsencoder.core.errors import InputError
 from gsencoder.core.process import memory_growth
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
@@ -77,26 +75,7 @@ class SyntheticTeacher:
         width: int = 32,
         wavelength: float = 1.0,
     ) -> None:
-        """Draws directions and waves.
-
-        Args:
-            channels: D.
-            rank: directions that carry the signal.
-            noise: share of the energy that is noise, in [0, 1).
-            seed: of everything that is random.
-            height: cells of a map; the whole image is resized to them, as 336 × 448 pixels to 24 × 32.
-            width: cells of a map.
-            wavelength: shortest wave of the signal in world units; the longest is four times as long.
-
-        Raises:
-            InputError: sizes that are not positive, rank above the channels, noise outside [0, 1).
-        """
-        if min(channels, rank, height, width) < 1 or rank > channels:
-            raise InputError(f"synthetic teacher: expected sizes ≥ 1 and rank ≤ channels, got {rank} of {channels}")
-        if not 0 <= noise < 1 or not 0 < wavelength < math.inf:
-            raise InputError(
-                f"synthetic teacher: expected noise in [0, 1) and wavelength > 0, got {noise}, {wavelength}"
-            )
+        """Draws directions and waves, the shortest of `wavelength` world units and the longest four times as long."""
         self.noise, self.seed, self.height, self.width, self.wavelength = noise, seed, height, width, wavelength
         rng = np.random.default_rng(seed)
         directions = rng.standard_normal((rank, channels))
@@ -121,13 +100,7 @@ class SyntheticTeacher:
         )
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The features of one view; the same view gives the same noise.
-
-        Raises:
-            InputError: the scene has no depth.
-        """
-        if views.depths is None:
-            raise InputError("synthetic teacher: the scene has no depth to find the points that its pixels see")
+        """The features of one view, which has depth; the same view gives the same noise."""
         cameras = views.cameras
         size = int(cameras.widths[view]), int(cameras.heights[view])
         affine = np.array([[self.width / size[0], 0, 0], [0, self.height / size[1], 0]])
@@ -146,14 +119,6 @@ class SyntheticTeacher:
         features += mixed @ self.directions
         features += self.center
         return FeatureMap(features=features, grid_from_image=affine, space=self.space)
-
-    def settings(self) -> dict[str, Any]:
-        return {
-            "name": "synthetic",
-            "space": self.space.weights,
-            "grid": [self.height, self.width],
-            "wavelength": self.wavelength,
-        }
 
 
 RANK = 32
@@ -179,8 +144,6 @@ def prepare(path: str, voxel: float, count: int) -> Problem:
     scene = load_scene(path)
     gaussians = seed(scene, SeedConfig(voxel=voxel))
     views = scene.views
-    assert views is not None
-    assert views.depths is not None
     chosen = range(len(views) if not count else min(count, len(views)))
     quiet = SyntheticTeacher(rank=RANK, noise=0.0)
     clean = [quiet.feature_map(views, view) for view in chosen]

@@ -64,8 +64,6 @@ def open_case(folder: Path, teacher_words: str, work: Path, bank: BankConfig) ->
     config = compose("fuse", FuseCommandConfig, ["-", *f"teacher={teacher_words}".split()])
     name = teacher_words.split()[0]
     kept, left_out = load_scene(folder / "kept", splat=SPLAT), load_scene(folder / "left_out")
-    assert kept.gaussians is not None
-    assert left_out.views is not None
     teacher = build_teacher(config.teacher, kept, words_of(config.teacher, config.text))
     start = time.perf_counter()
     tag = f"{name}_{bank.method}_{bank.threshold or bank.cosine}"

@@ -1,5 +1,5 @@
 """The error of every numeric routine at every extreme: remakes tests/stability/errors.csv, docs/numerics.png, and the
-measured errors in docs/numerics.md, whose table says what each routine promises.
+measured errors in docs/numerics.md, whose table says each routine's bound.
 
     python bench/numerics.py [--check]
 
@@ -32,8 +32,8 @@ def measured() -> Errors:
             if routine.why_not(extreme) is None:
                 errors[routine.name, extreme.name] = error_of(routine, extreme)
         worst = max(error for (name, _), error in errors.items() if name == routine.name)
-        over = "" if worst <= routine.promise else "  BROKEN"
-        print(f"{routine.name:55s} {worst:8.1e} of {routine.promise:7.1e}  {time.perf_counter() - start:5.2f} s{over}")
+        over = "" if worst <= routine.bound else "  ABOVE"
+        print(f"{routine.name:55s} {worst:8.1e} of {routine.bound:7.1e}  {time.perf_counter() - start:5.2f} s{over}")
     return errors
 
 
@@ -49,7 +49,7 @@ def document(errors: Errors) -> None:
 
 
 def picture(errors: Errors) -> None:
-    """log10 of the error: a row a routine, a column an extreme, and the promise in the last one."""
+    """log10 of the error: a row a routine, a column an extreme, and the bound in the last one."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -63,13 +63,13 @@ def picture(errors: Errors) -> None:
             error = errors.get((name, extreme))
             if error is not None:
                 values[row, column] = math.log10(max(error, 1e-18))
-        values[row, -1] = math.log10(max(ROUTINES[name].promise, 1e-18))
+        values[row, -1] = math.log10(max(ROUTINES[name].bound, 1e-18))
     figure, axes = plt.subplots(figsize=(13, 0.27 * len(names) + 2))
     colors = plt.get_cmap("viridis").copy()
     colors.set_bad("0.93")
     image = axes.imshow(values, cmap=colors, vmin=-17, vmax=-1, aspect="auto")
     ticks = [*range(len(columns)), len(columns) + 1]
-    axes.set_xticks(ticks, [*columns, "promise"], rotation=60, ha="left")
+    axes.set_xticks(ticks, [*columns, "bound"], rotation=60, ha="left")
     axes.xaxis.tick_top()
     axes.set_yticks(range(len(names)), names)
     for (row, column), value in np.ndenumerate(values):
@@ -86,7 +86,7 @@ def main() -> None:
     add_json_option(parser)
     options = parser.parse_args()
     errors = measured()
-    broken = [key for key, error in errors.items() if not error <= ROUTINES[key[0]].promise]
+    broken = [key for key, error in errors.items() if not error <= ROUTINES[key[0]].bound]
     cells = len(ROUTINES) * len(EXTREMES)
     print(
         f"{len(ROUTINES)} routines × {len(EXTREMES)} extremes: {len(errors)} of {cells} cells apply, {len(broken)} over"
@@ -94,7 +94,7 @@ def main() -> None:
     counts = {"routines": len(ROUTINES), "cells": len(errors), "over": len(broken)}
     write_figures(options.json, counts)
     for name, extreme in broken:
-        print(f"over its promise: {name} at {extreme}")
+        print(f"over its bound: {name} at {extreme}")
     if options.check:
         for (name, extreme), before in committed().items():
             error = errors.get((name, extreme))

@@ -65,7 +65,6 @@ def main() -> None:
     from gsencoder.data.splats.files import save_splat
 
     everything = with_gaussians(load_scene(chosen.scene)).gaussians
-    assert everything is not None
     far = np.linalg.norm(everything.means - np.median(everything.means, axis=0), axis=1)
     figures: dict[int, dict[str, float]] = {}
     for size in map(int, chosen.sizes.split(",")):

@@ -27,7 +27,6 @@ def main() -> None:
     chosen = parser.parse_args()
     teacher: TeacherConfig = LabelsConfig()
     words = text_table_of(teacher)
-    assert words is not None
     protocol, localization = LocalizationProtocol(), LocalizeConfig()
     hits = {budget: [] for budget in (0.0, *map(float, chosen.budgets.split(",")))}
     shares = {budget: list[float]() for budget in hits}

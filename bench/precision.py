@@ -40,7 +40,6 @@ def main() -> None:
     means, lows, seconds = ({name: list[float]() for name in encoders} for _ in range(3))
     for scene in chosen.scenes:
         gaussians = with_gaussians(load_scene(scene)).gaussians
-        assert gaussians is not None
         found = {name: encoder.encode(gaussians, config) for name, encoder in encoders.items()}
         best = dict.fromkeys(encoders, np.inf)
         for _ in range(PASSES):

@@ -84,7 +84,6 @@ def evidence_of(
         names: of all objects of the house.
         words: what is asked, each with the names of the objects that it stands for.
     """
-    assert scene.gaussians is not None
     protocol = AbsentProtocol()
     groups = words_to_ask(scene.objects, names, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
     present, absent = map(set, groups)
@@ -158,7 +157,6 @@ def main() -> None:
     else:
         words = words_of(LabelsConfig(), text)
         source = fusion_source(LabelsConfig(), words)
-    assert words is not None
     arguments.out.mkdir(parents=True, exist_ok=True)
     for path in rooms:
         file = arguments.out / f"{path.name}.npy"

@@ -97,7 +97,6 @@ def main() -> None:
     options = parser.parse_args()
     scene = load_scene(options.scene)
     gaussians = scene.gaussians if scene.gaussians is not None else seed(scene)
-    assert scene.views is not None
     cameras, view = scene.views.cameras, options.view
     on_cpu = partial(draw, cameras=cameras, view=view, config=CPU)
     inputs = leaves(gaussians, torch.float32)

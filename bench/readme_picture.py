@@ -29,12 +29,8 @@ def main() -> None:
     given = parser.parse_args()
 
     scene = with_gaussians(load_scene(given.scene))
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    assert scene.views.images is not None
     encoder = Encoder.load("house_cpu")
     features = encoder.encode(scene.gaussians)
-    assert encoder.words is not None
     found = localize(replace(scene, features={features.space.name: features}), given.words.split(","), encoder.words)
 
     view, cameras = given.view, scene.views.cameras

@@ -52,15 +52,12 @@ def main() -> None:
     words = vocabulary_of(OnnxTextConfig(model="minilm_l6", pooling="mean"))
     teacher = SegmenterTeacher(SegmenterConfig(model="mosaic_ade31.onnx", onnx=network), words)
     scene = load_scene(options.scene)
-    assert scene.views is not None
     views = scene.views
     left_out = np.arange(0, len(views), options.every)
     fitted = np.setdiff1d(np.arange(len(views)), left_out)
     scene = with_gaussians(replace(scene, views=views.select(fitted)))
     features = fuse(scene, teacher).features
-    assert scene.gaussians is not None
     basis = features.basis
-    assert basis is not None
     values = torch.from_numpy(np.concatenate([features.features, features.seen[:, None]], axis=1).astype(np.float32))
     centered = teacher.table - words.mean
     directions = centered / np.linalg.norm(centered, axis=1, keepdims=True)
@@ -72,8 +69,6 @@ def main() -> None:
         vectors = (maps[:, :-1] / np.maximum(maps[:, -1:], 1e-6)) @ basis.components + basis.mean - words.mean
         named = (vectors @ directions.T).argmax(axis=1)
         shares = teacher.feature_map(views, view).shares
-        assert shares is not None
-        assert views.images is not None
         image = views.images[view]
         predicted = shares.argmax(axis=-1).astype(np.uint8)
         predicted = np.asarray(Image.fromarray(predicted).resize(image.shape[1::-1], Image.Resampling.NEAREST)).ravel()

@@ -76,8 +76,6 @@ class Truth:
 
 def truth_of(gaussians: Gaussians, views: Views, blends: Sequence[Blend] | None, instances: int) -> Truth:
     """The instance on whose pixels most of each Gaussian's visible blending weight falls."""
-    assert views.instances is not None
-    assert views.depths is not None
     sums = torch.zeros(len(gaussians), instances)
     for view in range(len(views)):
         b = blends[view] if blends is not None else blend(gaussians, views.cameras, view)
@@ -98,7 +96,6 @@ def removal(
     gaussians: Gaussians, views: Views, blends: Sequence[Blend], selected: np.ndarray, true: np.ndarray, instance: int
 ) -> tuple[float, float]:
     """What is kept of an object, and the PSNR outside of it."""
-    assert views.instances is not None
     rest = gaussians.select(~selected)
     left = torch.from_numpy(true[~selected].astype(np.float32))
     marked, given = (torch.from_numpy(each.astype(np.float32)) for each in (true, selected))
@@ -136,7 +133,6 @@ def score(
     alone: bool,
 ) -> dict[str, list[float]]:
     """The figures of each object, by their name."""
-    assert scene.gaussians is not None
     asked = replace(scene, features={features.space.name: features})
     names = list(dict.fromkeys(target.name for target in targets if target.name))
     found = {}
@@ -150,7 +146,6 @@ def score(
             found[name] = (seeds, selection.labels == number + 1)
     figures: dict[str, list[float]] = defaultdict(list)
     for target in targets:
-        assert target.name is not None
         true = truth.labels == target.id
         for kind, selected in zip(("first box", "selected"), found[target.name], strict=True):
             count, weighted = ious(selected, true, truth.weights)
@@ -165,13 +160,11 @@ def score(
 def count_boxes(rooms: Sequence[Path], splats: Path | None) -> dict[str, dict[str, float]]:
     """Boxes a thing and the accuracy of first boxes, by radius and kind of object."""
     words = words_of(LabelsConfig())
-    assert words is not None
     configs = {"eps_spacings=1.5": LocalizeConfig(eps_spacings=1.5), "default": LocalizeConfig()}
     found: dict[str, list[tuple[bool, float, float]]] = defaultdict(list)
     seconds: dict[str, float] = defaultdict(float)
     for path in rooms:
         scene = with_gaussians(load_scene(path, splat=splats / path.name / "splat.ply" if splats else None))
-        assert scene.gaussians is not None
         features = fuse(scene, build_teacher(LabelsConfig(), scene, words)).features
         scene = replace(scene, features={features.space.name: features})
         targets = [each for each in scene.objects if each.name and is_seen(each, min_views=5, min_pixels=60)]
@@ -221,18 +214,14 @@ def main() -> None:
         write_figures(arguments.json, count_boxes(arguments.rooms, arguments.splats))
         return
     words, encoder = words_of(LabelsConfig()), load_encoder(arguments.weights)
-    assert words is not None
     totals: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for path in arguments.rooms:
         start = time.perf_counter()
         scene = load_scene(path)
-        assert scene.views is not None
         out = list(range(arguments.every // 2, len(scene.views), arguments.every))
         left_out = scene.views.select(out)
         kept = [view for view in range(len(scene.views)) if view not in out]
         scene = with_gaussians(replace(scene, views=scene.views.select(kept)))
-        assert scene.gaussians is not None
-        assert scene.views is not None
         targets = queryable_objects(scene.objects)
         blends = [blend(scene.gaussians, left_out.cameras, view) for view in range(len(left_out))]
         instances = max(each.id for each in scene.objects) + 1

@@ -62,8 +62,6 @@ def main() -> None:
     level, up = with_up(replace(scene, views=None, up=stated))
     print(f"up {'unknown' if up is None else up.describe()}")
     bare = with_views(level, options.orbits)[0]
-    assert bare.views is not None
-    assert bare.views.images is not None
     print(f"{len(bare.views)} cameras, {bare.views.names[0]} …")
     if options.sheet:
         pictures = [bare.views.images[view] for view in range(len(bare.views))]

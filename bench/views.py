@@ -54,7 +54,6 @@ def objects_of(path: str, large: bool) -> tuple[Scene, list[tuple[Target, SceneO
     """A scene with Gaussians, and what was found of its objects beside the labels."""
     words = load_text_table(find_file(WORDS, "words"))
     scene = with_gaussians(load_scene(path))
-    assert scene.gaussians is not None
     features = fuse(scene, build_teacher(LabelsConfig(words=WORDS), scene, words)).features
     scene = replace(scene, features={features.space.name: features})
     asked = furniture(scene.objects) if large else queryable_objects(scene.objects)
@@ -69,22 +68,17 @@ def objects_of(path: str, large: bool) -> tuple[Scene, list[tuple[Target, SceneO
         # Another one of the name may have been found, which is not among those that frames show well.
         if any(one.id == nearest.id for one in asked):
             pairs.append((target, nearest))
-    assert scene.views is not None
     # Frames are judged as renders, as they are when features are all that there is.
     return replace(scene, views=replace(scene.views, images=None)), pairs
 
 
 def pixels_of(scene: Scene, one: SceneObject) -> np.ndarray:
     """Pixels of an object in each frame, by its instance mask."""
-    assert scene.views is not None
-    assert scene.views.instances is not None
     return np.array([int((mask == one.id).sum()) for mask in scene.views.instances])
 
 
 def measured(scene: Scene, target: Target, chosen: ViewSet) -> dict[str, np.ndarray]:
     """What full renders of chosen views show."""
-    assert scene.gaussians is not None
-    assert scene.views is not None
     (seen,) = score_views(scene.gaussians, chosen.cameras, [target], side=640, config=BlendConfig())
     free = FreeSpace(scene.gaussians).seen_by(scene.views.cameras)
     centers = chosen.cameras.centers

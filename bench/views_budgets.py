@@ -44,7 +44,6 @@ def main() -> None:
         scene = load_features(folder)
         queried, words = queried_scene(scene, folder)
         gaussians = scene.gaussians
-        assert gaussians is not None
         if given.scenes is None:
             names = given.queries.split(",")
         else:

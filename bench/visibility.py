@@ -55,7 +55,6 @@ def main() -> None:
     warnings.simplefilter("ignore", SceneWarning)
     teacher = LabelsConfig(cell=options.cell)
     words = text_table_of(teacher)
-    assert words is not None
     tests = {name: VISIBILITIES[name] for name in options.only.split(",") if name} or VISIBILITIES
     thresholds = [float(value) for value in options.thresholds.split(",")]
     hits: dict[tuple[float, str, str, float], list[Hit]] = {}

@@ -146,7 +146,7 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path):
     ):
         with pytest.raises(InputError, match=f"{name}.npy.*{problem}"):
             DepthFiles([with_depth(tmp_path / f"{name}.npy")], [grid()])[0]
-    # A header that promises more than the file holds.
+    # A header that claims more than the file holds.
     data = (tmp_path / "negative.npy").read_bytes()
     (tmp_path / "cut.npy").write_bytes(data[:-8])
     with pytest.raises(InputError, match=r"cut\.npy"):

@@ -103,7 +103,7 @@ def test_median_depth_is_where_half_the_light_is_lost() -> None:
         _ = blend(both, front_camera(), patch=4).median_depth
 
 
-def test_dropping_small_weights_loses_at_most_what_it_promises() -> None:
+def test_dropping_small_weights_loses_at_most_its_bound() -> None:
     g, camera = random_gaussians(400, 9), front_camera()
     full, cut = blend(g, camera), blend(g, camera, config=BlendConfig(min_weight=0.01))
     assert float(cut.weight.min()) >= 0.01

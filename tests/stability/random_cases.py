@@ -1,4 +1,4 @@
-"""Random extreme cases, for searches: several things may be extreme at once, within what routines promise."""
+"""Random extreme cases, for searches: several things may be extreme at once, within the domains of routines."""
 
 import math
 from dataclasses import dataclass, replace

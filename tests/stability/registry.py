@@ -1,4 +1,4 @@
-"""Numeric routines with what they promise, and the error of each at each extreme."""
+"""Numeric routines with their bounds, and the error of each at each extreme."""
 
 import csv
 import math
@@ -17,7 +17,7 @@ FACTOR = 8
 """How many times its error in the table a cell may have: other processors, libraries and numbers of threads round
 otherwise."""
 NEGLIGIBLE = 0.02
-"""Share of its promise below which a cell's error is not compared with the table."""
+"""Share of its bound below which a cell's error is not compared with the table."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Routine:
     Attributes:
         name: in the table of docs/numerics.md, which says what it takes, and how its error is meant.
         reads: the parts of a case that it reads.
-        promise: largest error that it promises there.
+        bound: largest error there.
         error: of a case.
         exempt: extremes outside the domain, or that say nothing about the routine, with the reason.
         limits: of fields of `random_cases.Recipe`, where the domain is narrower than what searches draw from.
@@ -35,7 +35,7 @@ class Routine:
 
     name: str
     reads: frozenset[str]
-    promise: float
+    bound: float
     error: Callable[[Case], float]
     exempt: dict[str, str]
     limits: dict[str, tuple[float, float]]
@@ -58,7 +58,7 @@ ROUTINES: dict[str, Routine] = {}
 
 
 def table_rows() -> dict[str, list[str]]:
-    """The cells of the table of docs/numerics.md by routine: domain, promise, and how its error is meant."""
+    """The cells of the table of docs/numerics.md by routine: domain, bound, and how its error is meant."""
     rows = [line.strip("| ").split(" | ") for line in DOCUMENT.read_text().splitlines() if line.startswith("| ")]
     return {row[0]: row[1:] for row in rows if len(row) > 3}
 
@@ -127,4 +127,4 @@ def write_table(errors: dict[tuple[str, str], float]) -> None:
 
 def most(routine: Routine, error: float) -> float:
     """The largest error that a cell may have, given the one in the table."""
-    return min(routine.promise, max(FACTOR * error, NEGLIGIBLE * routine.promise))
+    return min(routine.bound, max(FACTOR * error, NEGLIGIBLE * routine.bound))

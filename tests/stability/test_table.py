@@ -1,4 +1,4 @@
-"""Every numeric routine at every extreme: within its promise, and not worse than the table says.
+"""Every numeric routine at every extreme: within its bound, and not worse than the table says.
 
 `python bench/numerics.py` remakes the table, and docs/numerics.md with it.
 """
@@ -22,14 +22,14 @@ assert routines
 
 
 @pytest.mark.parametrize("name", ROUTINES)
-def test_a_routine_keeps_its_promise_at_every_extreme(name: str) -> None:
+def test_a_routine_stays_within_its_bound_at_every_extreme(name: str) -> None:
     routine, table, broken = ROUTINES[name], committed(), []
     for extreme in EXTREMES:
         if routine.why_not(extreme) is None:
             error, before = error_of(routine, extreme), table[name, extreme.name]
             assert before is not None, f"{extreme.name} applies, and has no error in the table"
             if not error <= most(routine, before):
-                broken.append(f"{extreme.name}: {error:.2e}, was {before:.1e}, promised {routine.promise:g}")
+                broken.append(f"{extreme.name}: {error:.2e}, was {before:.1e}, bound {routine.bound:g}")
     assert not broken
 
 
@@ -40,7 +40,7 @@ def test_the_table_has_every_cell_with_an_error_or_a_reason() -> None:
         for extreme in EXTREMES:
             assert (table[routine.name, extreme.name] is None) == (routine.why_not(extreme) is not None)
     assert set(ROUTINES) == set(PROMISES)
-    assert all(error is None or error <= ROUTINES[name].promise for (name, _), error in table.items())
+    assert all(error is None or error <= ROUTINES[name].bound for (name, _), error in table.items())
 
 
 def test_the_oracle_of_compositing_agrees_with_the_plain_twin_in_float64() -> None:
@@ -90,20 +90,20 @@ def allows(routine: Routine, recipe: Recipe) -> bool:
 
 
 @pytest.mark.parametrize("name", ROUTINES)
-def test_no_case_within_its_domain_breaks_a_promise(name: str) -> None:
+def test_no_case_within_its_domain_exceeds_a_bound(name: str) -> None:
     routine = ROUTINES[name]
 
     @SEARCH
     @given(recipe=recipes(routine))
     def search(recipe: Recipe) -> None:
-        assert routine.error(recipe.make()) <= routine.promise
+        assert routine.error(recipe.make()) <= routine.bound
 
     search()
 
 
 @pytest.mark.parametrize("name", ROUTINES)
-def test_what_once_broke_a_promise_no_longer_does(name: str) -> None:
+def test_what_once_exceeded_a_bound_no_longer_does(name: str) -> None:
     routine = ROUTINES[name]
     for recipe in FAILED:
         if allows(routine, recipe):
-            assert routine.error(recipe.make()) <= routine.promise, recipe
+            assert routine.error(recipe.make()) <= routine.bound, recipe
