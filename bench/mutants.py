@@ -34,7 +34,7 @@ MODULES = (
     "geometry",
     "fusion/lift",
     "fusion/basis",
-    "infer/boxes",
+    "infer/localize",
     "infer/relevancy",
     "infer/views/choose",
     "train/losses",
