@@ -1,4 +1,4 @@
-"""A synthetic room written in each layout of RGB-D sequences."""
+"""A synthetic room written in each layout of scenes but transforms.json and COLMAP: `WRITERS`."""
 
 import json
 from collections.abc import Callable

@@ -57,8 +57,13 @@ class TeacherSettings(CheckedConfig):
         raise NotImplementedError
 
     def refuse_text(self) -> str:
-        """Why its words cannot be those of a text tower (`text=`); empty where they can be."""
-        if getattr(self, "words", ""):
+        """Why its words cannot be those of a text tower (`text=`); empty where they can be, for which settings have an
+        option `words`."""
+        if not hasattr(self, "words"):
+            return (
+                f"text=: no text tower leads into the features of teacher={getattr(self, 'name', '')}; leave out text="
+            )
+        if self.words:
             return "text= and teacher.words= both say what words are; leave out one of them"
         return ""
 

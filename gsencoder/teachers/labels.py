@@ -159,9 +159,6 @@ class PaletteConfig(TeacherSettings):
     def text_table(self) -> TextTable:
         return make_text_table(COLOR_NAMES, np.eye(len(COLOR_NAMES), dtype=np.float32), "palette-11")
 
-    def refuse_text(self) -> str:
-        return "text=: teacher=palette has the words of its eleven colors; leave out text="
-
 
 def lab_from_rgb(rgb: UInt8[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
     """CIE L*a*b* (D65) of 8-bit sRGB; distances in it roughly match what people see (L* from 0 to 100)."""

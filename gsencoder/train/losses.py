@@ -214,7 +214,7 @@ class LossInputs(NamedTuple):
 
 class Term(NamedTuple):
     """A term of the loss: Σ_i w_i · loss_i, its weights w, which are known before anything is computed, and whether it
-    compares classes of targets, which dense teachers lack."""
+    compares classes of targets, which dense teachers lack. A statistic of a batch gives Σ_i w_i times its value."""
 
     total: Callable[[LossInputs], Float[Tensor, ""]]
     weights: Callable[[TeacherTargets], Float[Tensor, " n"]]

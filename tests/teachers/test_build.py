@@ -118,7 +118,7 @@ TOWER = OnnxTextConfig(model="nowhere")
 @pytest.mark.parametrize(
     ("teacher", "problem"),
     [
-        (PaletteConfig(), "has the words of its eleven colors"),
+        (PaletteConfig(), "no text tower leads into the features of teacher=palette"),
         (RadioConfig(), "no text tower speaks for the features of RADIO's backbone"),
         (OnnxConfig(classes="c.npz"), "have vectors of their own"),
         (OnnxConfig(), "if teacher.joint=true says that both belong to one joint model"),

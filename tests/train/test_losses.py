@@ -145,7 +145,7 @@ def test_unseen_gaussians_have_no_kind_and_no_part_in_the_contrast() -> None:
 
 
 def test_a_loss_of_no_term_and_a_temperature_of_zero_are_refused() -> None:
-    with pytest.raises(InputError, match="contrast_weight: expected one above 0"):
+    with pytest.raises(InputError, match="_weight: expected one above 0"):
         LossConfig(field_weight=0.0, render_weight=0.0)
     LossConfig(field_weight=0.0, render_weight=0.0, contrast_weight=1.0)
     with pytest.raises(InputError, match="temperature"):
