@@ -55,7 +55,6 @@ class Checker:
         if case.server:
             words += [f"vlm.base_url={url}", "vlm.retries=0"]
         self._turn = 0
-        self.continued = 0
         self._known: dict[str, list[str]] = {}
         first = self.new()
         for warm in (True, False):
@@ -141,7 +140,6 @@ class Checker:
         left = json.dumps([tidy(hidden(contents(folder))), sorted(hidden(dict.fromkeys(folders(folder), "")))])
         if left not in self._known:
             self._known[left] = self.next_run(folder, bool(stands) and not ref.case.several)
-            self.continued += 1
         wrong += self._known[left]
         self.drop(folder)
         return [f"{where}: {each}" for each in wrong]

@@ -2,7 +2,7 @@
 those of one of the two, and the other run says in one line that it gave way."""
 
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from fault_checks import Checker, folders, role, state
 from fault_runs import HALT, Run
@@ -10,10 +10,9 @@ from fault_runs import HALT, Run
 
 @dataclass
 class Pairs:
-    """Pairs of runs of a case, and how often the first, the second or both of the two ended well."""
+    """Pairs of runs of a case."""
 
     checker: Checker
-    outcomes: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Runs the case alone with the settings of the second run."""
@@ -63,8 +62,6 @@ class Pairs:
             wrong.append(f"what stands is of neither run: {[role(name) for name in names[:4]]}, {also[:4]}; {well}")
         if folders(folder) - ref.folders:
             wrong.append(f"left: {sorted(role(name) for name in folders(folder) - ref.folders)}")
-        how = " and ".join(well)
-        self.outcomes[how] = self.outcomes.get(how, 0) + 1
         checker.drop(folder)
         return [f"{where}: {each}" for each in wrong]
 

@@ -80,7 +80,8 @@ def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(run, 
 
 
 def test_an_example_renders_views_of_a_target(run: Callable[..., str], room: Path, tmp_path: Path) -> None:
-    assert cli.main(["fuse", str(room), "teacher=palette", f"out={tmp_path / 'features'}", "quiet=true"]) == 0
+    fuse = ["fuse", str(room), "teacher=palette", "seeds.voxel=0.05", f"out={tmp_path / 'features'}", "quiet=true"]
+    assert cli.main(fuse) == 0
     out = run(4, "features", "red")
     pictures = sorted(tmp_path.glob("view_*.png"))
     assert len(pictures) == len(out.splitlines()) == 8

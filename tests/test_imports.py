@@ -193,18 +193,6 @@ def test_an_upward_import_is_found_wherever_it_hides(module: str, source: str) -
     assert len(upward(source, module, {"load_splat": "data"})) == 1
 
 
-@pytest.mark.parametrize(
-    ("module", "source"),
-    [
-        ("gsencoder.fusion.fuse", "from gsencoder.render.blend import blend\nfrom ..data import scenes\nimport torch"),
-        ("gsencoder.data.scenes", "from gsencoder.data.splats.files import read_raw\nfrom .colmap import read"),
-        ("gsencoder.app.output", "import gsencoder\nfrom gsencoder import __version__"),
-    ],
-)
-def test_a_downward_import_is_left_alone(module: str, source: str) -> None:
-    assert upward(source, module, {}) == []
-
-
 def test_torch_free_modules_import_neither_torch_nor_codecs() -> None:
     # One after the other in one process: the first that brings one along is the one that is named.
     code = (

@@ -12,7 +12,6 @@ from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.encode import Encoder
-from gsencoder.infer.onnx.runtime import from_metadata, to_metadata
 from gsencoder.models.weights import load_weights
 
 pytestmark = pytest.mark.slow
@@ -146,20 +145,6 @@ def test_fusing_in_the_basis_of_one_of_several_teachers_needs_a_teacher_of_its_s
         "teacher.cell=8",
     )
     assert "gives features of" in line or "gives all channels" in line
-
-
-def test_an_exported_header_carries_all_spaces_and_their_words(trained: Path) -> None:
-    encoder = Encoder.load(str(trained))
-    header = encoder.network.header
-    entries = to_metadata(header)
-    assert json.loads(entries["gsencoder"])["version"] == 3
-    again = from_metadata(entries)
-    assert list(again.outputs) == ["labels", "palette"]
-    for name in again.outputs:
-        assert again.outputs[name].space == encoder.outputs[name].space
-        np.testing.assert_array_equal(again.outputs[name].mean, encoder.outputs[name].mean)
-        assert again.tables[name].names == encoder.tables[name].names
-    np.testing.assert_array_equal(again.outputs.unit, encoder.outputs.unit)
 
 
 def test_wrong_teachers_end_in_one_line(rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

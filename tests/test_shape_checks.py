@@ -1,6 +1,5 @@
 """The checks of types and shapes that the other tests run under."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,49 +44,6 @@ def test_what_does_not_fit_is_refused(a: Any, b: Any, rows: Any) -> None:
     assert joined(zeros(4, 3), b=zeros(4, 2)).shape == (4, 5)
     with pytest.raises(TypeCheckError):
         joined(a, b, rows=rows)
-
-
-def test_axes_of_one_name_are_those_of_one_call() -> None:
-    def outer(a: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-        return inner(np.concatenate([a, a]))[: len(a)]
-
-    @on
-    def inner(a: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-        return a
-
-    for size in (2, 3):
-        assert on(outer)(zeros(size)).shape == (size,)
-
-
-def test_the_checks_of_a_function_within_another_are_made_once() -> None:
-    def closure(name: str, axes: str) -> Callable[[Any], Any]:
-        @on
-        def inside(value: "Float32[np.ndarray, ''] | None", b: Float32[np.ndarray, axes] | None = None) -> list[Any]:
-            return [name, value, b]
-
-        return inside
-
-    before = len(shape_checks._checks)
-    for number in range(20):
-        assert closure(str(number), "n 3")(None) == [str(number), None, None]
-    assert len(shape_checks._checks) == before + 1
-    assert len(closure("0", "3 n")(None, zeros(3, 2))) == 3
-    assert len(shape_checks._checks) == before + 2
-    with pytest.raises(TypeCheckError):
-        closure("0", "n 3")(None, zeros(3, 2))
-
-
-def test_every_kind_of_parameter_is_checked() -> None:
-    @on
-    def kinds(a: int, /, b: int = 0, *more: int, c: int = 0, **others: int) -> int:
-        return a + b + sum(more) + c + sum(others.values())
-
-    assert (kinds(1), kinds(1, 2, 3, 4, c=5, d=6)) == (1, 21)
-    for args, more in ((("1",), {}), ((1,), {"b": "2"}), ((1, 2, "3"), {}), ((1,), {"c": "5"}), ((1,), {"d": "6"})):
-        with pytest.raises(TypeCheckError):
-            kinds(*args, **more)
-    with pytest.raises(TypeError, match="argument"):
-        kinds()
 
 
 def test_dataclasses_and_their_children_are_checked_where_they_are_made() -> None:

@@ -1,6 +1,5 @@
 """What a command is given, or a scene names, and is no file: exit code 2 within seconds, and a line that names it."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,36 +18,18 @@ OUT = {"export": "out.onnx", "repair": "out.ply"}
 KINDS = ("pipe", "device", "folder", "dangling")
 OPTIONS = [
     "fuse ROOM splat=BAD.ply teacher=palette",
-    "fuse ROOM teacher=labels teacher.words=BAD.npz",
     "encode ROOM weights=BAD.safetensors",
-    "pack FEATURES/BAD.safetensors",
     "localize FEATURES query=mug words=BAD.npz",
-    "localize FEATURES query=mug pose=BAD.json",
-    "localize FEATURES queries=BAD.txt",
     "ask FEATURES dry_run=true questions=BAD.jsonl",
-    "export weights=BAD.safetensors",
     "evaluate ROOM protocol=instances classes=BAD.csv",
-    "train ROOM split=BAD.txt",
     "repair BAD.ply",
-    "inspect BAD.sog",
     "reconstruct BAD.mp4",
-    "score instances predictions=TABLES truth=TABLES classes=scannet20 label_map=BAD.tsv",
-    "score answers predictions=BAD.json truth=TRUTH/answers.json",
-    "score answers predictions=TABLES/a.txt truth=BAD.json",
-    "score referring predictions=BAD.json truth=TABLES/a.txt",
-    "score captions predictions=TABLES/a.txt truth=BAD.json",
-    "score recognition predictions=BAD.json truth=TRUTH/labels.json",
-    "score retrieval predictions=BAD.npz truth=TRUTH/captions.json",
     "score semantics predictions=TABLES truth=TABLES classes=scannet20 scenes=BAD.txt",
 ]
 """Commands, and what stands for the thing that is no file."""
 CONTENTS = [
-    ("fuse ROOM teacher=palette", "room/transforms.json"),
-    ("fuse ROOM", "room/objects.json"),
     ("inspect ROOM", "room/transforms.json"),
     ("localize FEATURES query=mug", "features/features.safetensors"),
-    ("pack FEATURES", "features/scene.safetensors"),
-    ("score instances predictions=TABLES truth=TRUTH classes=scannet20", "truth/a.txt"),
     ("score instances predictions=TABLES truth=TRUTH classes=scannet20", "tables/a.txt"),
 ]
 """Commands, and the file of their inputs that is no file."""
@@ -61,12 +42,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("tables", "truth"):
         (folder / name).mkdir()
         (folder / name / "a.txt").write_text("1\n")
-    for name, entry in (
-        ("answers", {"question_id": "1", "question": "What?", "answers": ["mug"]}),
-        ("labels", {"object_id": 1, "label": "mug"}),
-        ("captions", {"view": "a", "caption": "a mug"}),
-    ):
-        (folder / "truth" / f"{name}.json").write_text(json.dumps([{"scene_id": "a", **entry}]))
     return folder
 
 
@@ -122,7 +97,6 @@ def test_other_errors_stay_as_they_are() -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ["view", "LOOP"],
         ["inspect", "LOOP"],
         ["localize", "LOOP", "query=mug"],
         ["export", "sizes=[99999999999]", "out=LOOP.onnx"],

@@ -7,7 +7,7 @@ import pytest
 from gsencoder.app.commands.encode import EncodeCommandConfig
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.compose import command_help, compose, run_many
+from gsencoder.app.compose import compose, run_many
 from gsencoder.app.main import COMMANDS
 from gsencoder.app.options import (
     PRESETS,
@@ -17,7 +17,7 @@ from gsencoder.app.options import (
     typed,
 )
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import shown_value, value_at
+from gsencoder.core.settings import value_at
 from gsencoder.fusion.budget import exact_config
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.infer.encode import EncodeConfig
@@ -48,16 +48,6 @@ def test_a_preset_changes_in_a_command_what_the_table_says_and_nothing_else(comm
         assert restored == settings(cls())
         # What differs from nothing is no change.
         assert all(values[key] != back[key] for key in values)
-
-
-@pytest.mark.parametrize("command", ["fuse", "repair"])
-def test_help_says_what_each_preset_changes_or_that_it_changes_nothing(command: str) -> None:
-    cls = COMMANDS[command].load()[0]
-    text = " ".join(command_help(command, "", cls, {}).split())
-    for preset in PRESETS:
-        values = ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, preset).items())
-        nothing = "the defaults" if preset == "balanced" else "changes nothing in this command"
-        assert f"preset={preset} {values or nothing}" in text
 
 
 def test_every_row_of_the_table_is_an_option_of_a_command() -> None:

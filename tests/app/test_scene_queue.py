@@ -11,7 +11,6 @@ import pytest
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import main as cli
-from gsencoder.app.commands import fuse
 from gsencoder.app.options import SharedScenesConfig
 from gsencoder.app.output import Summary, output_folder
 from gsencoder.app.run import Run
@@ -86,26 +85,6 @@ def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Pa
     # What comes after the last scene is of none.
     assert summary.add_warning("disk: slow") == "disk: slow"
     assert given[-1].warnings == ["weights: old", texts["c"]]
-
-
-def test_a_broken_limit_of_one_of_several_scenes_names_it_on_the_screen_and_stands_in_its_summary_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run_one(path: Path, out: Path, one: Run) -> None:
-        with output_folder(out, summary=one):
-            one.report_choice(path.name, {}, predicted={}, notes=[])
-            one.report_budget(fuse.FusionBudget(seconds=1.0), {"seconds": 1.5 if path.name == "one" else 2.5})
-
-    def run(config: fuse.FuseCommandConfig, run: Run) -> None:
-        run.scenes([*map(Path, config.paths)], "features", run_one)
-
-    monkeypatch.setattr(fuse, "run", run)
-    out = tmp_path / "out"
-    assert cli.main(["fuse", str(tmp_path / "one"), str(tmp_path / "two"), "teacher=palette", f"out={out}"]) == 0
-    broken = "budget.seconds: the limit is 1, and it became"
-    assert capsys.readouterr().err == f"warning: one: {broken} 1.5\nwarning: two: {broken} 2.5\n"
-    for name, seconds in (("one", 1.5), ("two", 2.5)):
-        assert json.loads((out / name / "summary.json").read_text())["warnings"] == [f"{broken} {seconds}"]
 
 
 def test_results_of_other_settings_are_neither_taken_nor_replaced(tmp_path, capsys):

@@ -33,10 +33,6 @@ def copy_rows(raw: RawSplat) -> RawSplat:
 PLANTED: dict[str, tuple[str, tuple[int, ...], Plant]] = {
     "nan mean": ("nonfinite", (4, 9), put("means", [4, 9], np.nan, 1)),
     "mean beyond float32": ("nonfinite", (4,), put("means", [4], 1e39, 1)),
-    "inf quaternion": ("nonfinite", (4,), put("quats", [4], -np.inf, 3)),
-    "nan sh": ("nonfinite", (4,), put("sh", [4], np.nan)),
-    "nan scale": ("nonfinite", (4,), put("log_scales", [4], np.nan, 0)),
-    "nan opacity": ("nonfinite", (4,), put("logit_opacities", [4], np.nan)),
     "zero quaternion": ("quats", (0, 299), put("quats", [0, 299], 0)),
     "tiny quaternion": ("quats", (5,), put("quats", [5], 1e-13)),
     "zero scale": ("scales", (5,), put("log_scales", [5], -np.inf, 2)),
@@ -159,14 +155,6 @@ def test_reports_are_json(tmp_path):
     _, report = repair_splat(raw, ["quats"])
     repaired = json.loads(json.dumps(report.to_dict(), allow_nan=False))
     assert repaired["changes"] == [{"fix": "quats", "count": 1, "action": "set to the identity rotation"}]
-
-
-@pytest.mark.shared
-@pytest.mark.parametrize("name", ["guitar.compressed.ply", "biker.spz", "playbot_sog"])
-def test_the_real_files_have_no_defect(shared, name):
-    report = inspect_splat(read_raw(shared / "fixtures" / name))
-    assert report.defects == ()
-    assert report.loadable
 
 
 def surface(count: int = 40, *, step: float = 0.02, scale: float = 0.012) -> RawSplat:

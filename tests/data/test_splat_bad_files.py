@@ -17,6 +17,7 @@ import splat_samples as samples
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats import files as splats
 from gsencoder.data.splats.files import load_splat, read_raw, save_splat
+from gsencoder.data.splats.repair import inspect_splat
 
 
 def spz4(count: int, sizes: list[tuple[int, int]], body: bytes = b"", degree: int = 0) -> bytes:
@@ -49,14 +50,11 @@ HOSTILE = {
     "cut_header.ply": (GOOD_PLY[:200], "no 'end_header'"),
     "cut.ply": (GOOD_PLY[:-1], "1 missing"),
     "huge.ply": (GOOD_PLY.replace(b"vertex 8", b"vertex 999999999999"), "999,999,999,999 rows"),
-    "negative.ply": (GOOD_PLY.replace(b"vertex 8", b"vertex -8"), "line 4"),
     "none.ply": (GOOD_PLY.replace(b"vertex 8", b"vertex 0"), "no Gaussians"),
     "points.ply": (GOOD_PLY.replace(b"f_dc_", b"color_"), "expected a Gaussian splat"),
     "surfels.ply": (GOOD_PLY.replace(b"scale_2", b"thick"), "2D splat"),
     "rest.ply": (GOOD_PLY.replace(b"f_rest_8", b"other_8"), "8 f_rest"),
     "twice.ply": (GOOD_PLY.replace(b"f_rest_8", b"f_rest_7"), "repeats a property"),
-    "type.ply": (GOOD_PLY.replace(b"property float y", b"property quad y"), "line 6"),
-    "format.ply": (GOOD_PLY.replace(b"binary_little_endian", b"binary_middle_endian"), "line 2"),
     "list.ply": (GOOD_PLY.replace(b"property float y", b"property list uchar int y"), "no element 'vertex' of plain"),
     "ascii_huge.ply": (
         samples.ply_bytes(samples.ply_columns(samples.make_raw(2, 0)), "ascii").replace(b"ex 2", b"ex 99999999999"),
@@ -67,7 +65,6 @@ HOSTILE = {
         "cannot be read",
     ),
     "odd.splat": (bytes(33), "32-byte rows"),
-    "short.spz": (b"NGSP" + bytes(5), "32"),
     "version.spz": (struct.pack("<4sI24x", b"NGSP", 9), "version 9"),
     "streams.spz": (spz4(3, [(1, 1)] * 2), "expected 5 streams"),
     "sizes.spz": (spz4(3, [(2**63, 27)] * 5, bytes(50)), "truncated or damaged"),
@@ -87,12 +84,10 @@ HOSTILE = {
     "meta_bomb.sog": (samples.zipped({"meta.json": bytes(50_000_000)}), "more than the"),
     "version.sog": (sog_with(version=1), "version 1"),
     "count.sog": (sog_with(count=10**12), "exhaust memory"),
-    "count_type.sog": (sog_with(count=True), "count"),
     "few_pixels.sog": (sog_with(count=4000), "too few"),
     "leaves.sog": (sog_with(quats__files=["../../etc/passwd"]), "expected a file name"),
     "missing.sog": (sog_with(quats__files=["gone.webp"]), "no member"),
     "codebook.sog": (sog_with(scales__codebook=[0.0] * 9), "codebook with 9"),
-    "codebook_type.sog": (sog_with(scales__codebook=["a"] * 256), "something else than numbers"),
     "mins.sog": (sog_with(means__mins=[1.0]), "expected 3 numbers as means.mins"),
     "palette.sog": (sog_with(shN__count=1), "beyond the 1 entries"),
     "bands.sog": (sog_with(shN__bands=9), "shN.bands 9"),
@@ -187,3 +182,12 @@ def test_a_full_disk_or_a_kill_in_mid_write_leaves_the_old_file(tmp_path, monkey
         save_splat(tmp_path / "a.spz", gaussians)
     assert os.listdir(tmp_path) == ["a.spz"]
     assert (tmp_path / "a.spz").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.splat"])
+def test_a_signalling_nan_in_any_column_is_counted(tmp_path, name):
+    data = bytearray(samples.valid_files(tmp_path)[name])
+    start = data.find(b"end_header\n") + len(b"end_header\n") if name == "a.ply" else 0
+    data[start : start + 24] = np.full(6, 0x7F800001, np.uint32).tobytes()
+    (tmp_path / name).write_bytes(data)
+    assert inspect_splat(read_raw(tmp_path / name)).defects[0].first_rows == (0,)

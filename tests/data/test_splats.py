@@ -3,8 +3,6 @@
 import gzip
 import os
 import struct
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -165,12 +163,9 @@ def test_quaternions_of_any_length_are_normalised_without_a_word(tmp_path):
     ("field", "value", "words"),
     [
         ("means", np.nan, "3 with NaN or Inf"),
-        ("sh", np.inf, "3 with NaN or Inf"),
         ("quats", 0, "3 with a zero quaternion"),
         ("log_scales", -200, "3 with scales that are 0 or overflow"),
-        ("log_scales", 100, "3 with scales that are 0 or overflow"),
         ("logit_opacities", np.inf, "3 with infinite opacity logits"),
-        ("logit_opacities", np.nan, "3 with NaN or Inf"),
     ],
 )
 def test_a_defect_is_a_counted_error_that_points_to_repair(tmp_path, field, value, words):
@@ -230,11 +225,3 @@ def test_a_fingerprint_changes_with_one_bit_and_with_the_order_of_rows():
     sh[9, 3, 2] = np.nextafter(sh[9, 3, 2], np.float32(9))
     others = [replace(gaussians, sh=sh), gaussians.select(np.arange(10)[::-1]), gaussians.select(np.arange(9))]
     assert len({fingerprint(gaussians), *map(fingerprint, others)}) == 4
-
-
-def test_loading_needs_neither_torch_nor_numba(tmp_path):
-    save_splat(tmp_path / "a.ply", samples.make_gaussians(3, 0))
-    code = f"import sys; from gsencoder.data.splats.files import load_splat; load_splat({str(tmp_path / 'a.ply')!r})"
-    code += "; print([m for m in ('torch', 'numba', 'gsply', 'open3d', 'scipy') if m in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert result.stdout.strip() == "[]"

@@ -90,13 +90,3 @@ def test_a_room_is_seeded_on_its_surfaces_although_few_features_match(shared):
     assert len(made.points) > 1000
     distance = cKDTree(seed(scene).means).query(made.points)[0]
     assert np.median(distance) < 0.04
-
-
-@pytest.mark.slow
-def test_the_plush_is_triangulated_where_its_own_model_has_points(shared):
-    scene = load_scene(shared / "scenes" / "plush", options=SceneConfig(image_scale=0.5, max_views=10))
-    points, _ = triangulate(scene.views)
-    assert len(points) > 30
-    distance = cKDTree(scene.sfm_points).query(points)[0]
-    extent = np.ptp(np.quantile(scene.sfm_points, (0.05, 0.95), axis=0), axis=0).max()
-    assert np.median(distance) < 0.01 * extent

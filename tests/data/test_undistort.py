@@ -102,11 +102,9 @@ def test_pixels_without_content_are_black_and_masked(tmp_path):
         (CameraModel(model="PINHOLE", width=720, height=540, params=(20.0, 20.0, 360.0, 270.0)), "170°"),
         (CameraModel(model="PINHOLE", width=720, height=540, params=(-1.0, 20.0, 360.0, 270.0)), "focal length"),
         (CameraModel(model="PINHOLE", width=720, height=540, params=(float("nan"), 20.0, 360.0, 270.0)), "finite"),
-        (CameraModel(model="PINHOLE", width=720, height=540, params=(1e-312, 20.0, 360.0, 270.0)), "is not a camera's"),
         (CameraModel(model="PINHOLE", width=720, height=540, params=(1e8, 1e8, 360.0, 270.0)), "is not a camera's"),
         (CameraModel(model="PINHOLE", width=0, height=540, params=(500.0, 500.0, 360.0, 270.0)), "picture size"),
         (CameraModel(model="OPENCV", width=720, height=540, params=(500.0, 500.0, 360.0, 270.0, 0.1)), "do not fit"),
-        (CameraModel(model="OPENCV", width=720, height=540, params=()), "finite numbers"),
     ],
 )
 def test_cameras_that_cannot_be_undistorted_are_named_errors(camera, problem):

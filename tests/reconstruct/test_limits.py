@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from archives import header_of, rewrite
+from command_runs import refusal, results_of
 from PIL import Image
-from reconstructions import cut_at, refusal, summary_of
+from reconstructions import cut_at
 
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
@@ -113,7 +114,7 @@ def test_limits_and_what_became_of_them_are_printed_and_recorded(folder, tmp_pat
     words += ["data.image_scale=0.5"]
     assert cli.main([*words, "budget.seconds=500", "budget.megabytes=0.04"]) == 0
     printed = capsys.readouterr()
-    results = summary_of(tmp_path / "out")["results"]
+    results = results_of(tmp_path / "out")
     budget = results["budget"]
     assert budget["limits"] == {"seconds": 500.0, "megabytes": 0.04}
     assert budget["chosen"]["steps"] == STEPS
@@ -125,7 +126,7 @@ def test_limits_and_what_became_of_them_are_printed_and_recorded(folder, tmp_pat
 
 
 def test_a_limit_with_an_option_that_it_chooses_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    problem = refusal(capsys, str(folder), "budget.seconds=60", "preset=exact")
+    problem = refusal(capsys, "reconstruct", str(folder), "budget.seconds=60", "preset=exact")
     assert "optimize.steps=3000: is chosen by budget.seconds; leave it (or the preset that sets it) out" in problem
 
 
@@ -188,6 +189,6 @@ def test_a_limit_that_registering_alone_exceeds_is_refused_in_the_midst_of_it(tm
     for name in "abc":
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg")
     monkeypatch.setattr(sfm, "_map", lambda *arguments: arguments[-2]())
-    problem = refusal(capsys, str(tmp_path), "budget.seconds=0.001", f"out={tmp_path / 'out'}")
+    problem = refusal(capsys, "reconstruct", str(tmp_path), "budget.seconds=0.001", f"out={tmp_path / 'out'}")
     assert "budget.seconds=0.001: is over before the first step: " in problem
     assert "s went into registering the photographs; give more seconds, fewer photographs" in problem

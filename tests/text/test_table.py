@@ -36,12 +36,9 @@ def save_npz(path: Path, **arrays: np.ndarray) -> Path:
         ("  MUG\t", "mug"),
         ("mugs", "mug"),
         ("a mug", "mug"),
-        ("the Tennis_Balls", "tennis ball"),
         ("tennis-ball", "tennis ball"),
         ("knives", "knife"),
-        ("cherries", "cherry"),
         ("boxes", "box"),
-        ("glass", "glass"),
         ("glasses", "glasses"),
         ("scissor", "scissors"),
         ("t shirts", "T-shirt"),
@@ -135,7 +132,6 @@ def test_a_table_saved_in_half_precision_is_half_as_large_and_has_unit_rows(tmp_
         ({"names": np.array(["x", ""]), "embeddings": np.eye(2)}, "row 1 is empty"),
         ({"names": np.array(["x", "y"]), "embeddings": np.eye(2) * 3}, "'x' has norm 3"),
         ({"names": np.array(["x", "y"]), "embeddings": np.eye(2) * np.nan}, "finite unit vectors"),
-        ({"names": np.array(["x"]), "embeddings": np.zeros((1, 0))}, "got shape"),
     ],
 )
 def test_a_table_that_is_none_says_what_is_wrong(tmp_path, no_jaxtyping, arrays, message):
@@ -171,23 +167,6 @@ def test_a_header_that_claims_another_size_is_refused_before_memory_is_taken(tmp
         load_text_table(path)
 
 
-def test_a_bomb_is_refused_by_the_size_that_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "bomb.npz"
-    np.savez_compressed(path, names=np.array(["x"]), embeddings=np.zeros((1, 100_000), np.float32))
-    monkeypatch.setattr("gsencoder.core.archive.LARGEST_ARRAY", 100_000)
-    with pytest.raises(InputError, match="claims 400,128 bytes"):
-        load_text_table(path)
-
-
-def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None:
-    from safetensors.numpy import save_file
-
-    path = tmp_path / "other.safetensors"
-    save_file({"embeddings": np.eye(2, dtype=np.float32)}, path)
-    with pytest.raises(InputError, match="expected version 2 of the format, got None"):
-        load_text_table(path)
-
-
 @pytest.mark.shared
 def test_the_real_table_knows_what_its_names_say(shared: Path) -> None:
     table = load_text_table(shared / "models" / "clip_vitb32_names.npz")
@@ -218,16 +197,6 @@ def test_names_longer_than_words_are_refused_before_memory_is_taken(tmp_path: Pa
         assert tracemalloc.get_traced_memory()[1] < 4_000_000
     finally:
         tracemalloc.stop()
-
-
-@pytest.mark.parametrize("wrong", ["norm", "repeated", "unknown"])
-def test_no_error_of_a_table_repeats_a_long_name(wrong: str, no_jaxtyping: None) -> None:
-    length = 1_000_000
-    names = ["x" * length, "x" * length if wrong == "repeated" else "y"]
-    rows = np.eye(2, dtype=np.float32) * (2 if wrong == "norm" else 1)
-    with pytest.raises(InputError) as caught:
-        make_text_table(names, rows, "toy" * length).encode(["x" * (length - 1)])
-    assert len(str(caught.value)) < 1000
 
 
 def space(encoder: str, channels: int = 4, teacher: str = "") -> FeatureSpace:

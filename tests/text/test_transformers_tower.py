@@ -153,20 +153,6 @@ def test_folders_that_do_not_fit_are_one_line(saved: Any) -> None:
     assert "holds no model that transformers reads" in problem()
 
 
-def test_loading_leaves_what_transformers_prints_as_it_was(saved: Any) -> None:
-    from transformers.utils import logging
-
-    folder, _ = saved(bert)
-    before, level = logging.is_progress_bar_enabled(), logging.get_verbosity()
-    try:
-        for bar in (True, False):
-            (logging.enable_progress_bar if bar else logging.disable_progress_bar)()
-            TransformersTower(TransformersTextConfig(model=str(folder), pooling="mean"))
-            assert (logging.is_progress_bar_enabled(), logging.get_verbosity()) == (bar, level)
-    finally:
-        (logging.enable_progress_bar if before else logging.disable_progress_bar)()
-
-
 def test_a_model_without_a_largest_length_takes_any_phrase(saved: Any) -> None:
     config = transformers.BloomConfig(vocab_size=len(WORDS), hidden_size=16, n_layer=1, n_head=2)
     assert not hasattr(config, "max_position_embeddings")

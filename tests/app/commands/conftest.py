@@ -11,34 +11,34 @@ from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rooms") / "room"
     write_room(make_room(0, objects=4, views=6, width=120, height=90), folder)
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def built(room: Path) -> Path:
     out = room.parent / "built"
     assert cli.main(["reconstruct", str(room), f"out={out}", *QUICK]) == 0
     return out
 
 
-@pytest.fixture(scope="module")
-def ten(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten photographs that belong together, and one that shows nothing."""
+@pytest.fixture(scope="session")
+def photographs(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six photographs that belong together, and one that shows nothing."""
     from PIL import Image
 
-    folder = tmp_path_factory.mktemp("ten") / "photographs"
+    folder = tmp_path_factory.mktemp("plush") / "photographs"
     folder.mkdir()
-    for path in sorted((shared / "scenes" / "plush" / "images").iterdir())[:10]:
+    for path in sorted((shared / "scenes" / "plush" / "images").iterdir())[:6]:
         shutil.copy(path, folder)
     Image.new("RGB", (720, 540), (90, 90, 90)).save(folder / "grey.jpg")
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("room") / "features"
     save_room(folder, step=0.12)

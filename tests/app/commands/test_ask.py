@@ -124,8 +124,6 @@ def test_a_question_that_names_nothing_is_shown_even_frames_and_says_so(features
     summary = json.loads((tmp_path / "dry" / "summary.json").read_text())
     assert any("evenly spread views are shown" in line for line in summary["warnings"])
     assert [view["frame"] for view in summary["results"]["views"]] == [0, 11]
-    words = ("question=How large is this place?", "dry_run=true", "choose.source=shells", "choose.count=2")
-    assert cli.main(["ask", str(features), f"out={tmp_path / 'shells'}", *words, "quiet=true"]) == 0
 
 
 @pytest.mark.parametrize(

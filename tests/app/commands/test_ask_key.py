@@ -8,7 +8,6 @@ from typing import Any
 from urllib.parse import quote
 
 import pytest
-from asked_rooms import save_room
 from chat_server import Handler, completion, serving
 
 from gsencoder.app import main as cli
@@ -27,13 +26,6 @@ SPELLINGS = {
     KEY[:20],
 }
 ESCAPE = "\x1b[31m"
-
-
-@pytest.fixture(scope="module")
-def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("room") / "features"
-    save_room(folder, step=0.12)
-    return folder
 
 
 def echo(status: int, spelling: str, form: str) -> Any:

@@ -107,15 +107,6 @@ def test_objects_are_captioned_in_boxes_that_are_given(home: Path, tmp_path: Pat
     assert sum(map(len, predicted.values())) == len({each.key[:2] for each in described})
 
 
-def test_situations_are_said_before_their_questions(home: Path, tmp_path: Path) -> None:
-    answered(home, tmp_path / "out", "situated_questions.json", answer("unknown"), "choose.source=frames")
-    questions = read_questions(home / "set" / "situated_questions.json")
-    read = read_answer_predictions(tmp_path / "out" / "predictions.json", questions)
-    assert read == {each.id: ("unknown",) for each in questions}
-    prompt = (tmp_path / "out" / ROOMS[0] / "00001" / "prompt.txt").read_text()
-    assert f"Question: {questions[0].situation} {questions[0].text}" in prompt
-
-
 def test_questions_of_other_scenes_are_counted_and_named(home: Path, tmp_path: Path) -> None:
     one = home / "features" / ROOMS[0]
     words = [f"questions={home / 'set' / 'questions.json'}", "dry_run=true", "quiet=true", *QUICK]

@@ -11,7 +11,6 @@ from gsencoder.app import main as cli
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.basis import describe_basis
 from gsencoder.fusion.errors import project_maps
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.onnx.export import random_cloud
@@ -100,11 +99,3 @@ def test_where_there_is_nothing_to_measure_one_line_says_so(folder, tmp_path, ca
         error = capsys.readouterr().err
         assert message in error
         assert "Traceback" not in error
-
-
-def test_a_phrase_states_what_is_known() -> None:
-    figures = {"rank": 128, "energy_kept": 0.99123}
-    assert describe_basis(figures, "this scene") == "rank 128, keeps 0.9912 of the energy"
-    figures |= {"other_energy": 0.915, "other_cosine": 0.93, "other_worst": 0.82}
-    expected = "rank 128, keeps 0.9912 of the energy, and 0.9150 in this scene (cosine 0.930, worst 5 % below 0.820)"
-    assert describe_basis(figures, "this scene") == expected

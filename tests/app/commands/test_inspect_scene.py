@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,6 @@ from PIL import Image
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import main as cli
-from gsencoder.data.readers.transforms_json import read_transforms, transforms_of
-from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.data.scenes import load_scene, read_posed
 from gsencoder.types import Cameras
 from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
@@ -56,11 +52,6 @@ def opencv_axes(content: dict[str, Any]) -> None:
     set_matrices(content, matrices(content) @ OPENCV_FROM_OPENGL)
 
 
-def wrong_focal(content: dict[str, Any]) -> None:
-    content["fl_x"] *= 1.1
-    content["fl_y"] *= 1.1
-
-
 def two_exchanged(content: dict[str, Any]) -> None:
     second, last = (content["frames"][row] for row in (1, 6))
     second["transform_matrix"], last["transform_matrix"] = last["transform_matrix"], second["transform_matrix"]
@@ -68,7 +59,6 @@ def two_exchanged(content: dict[str, Any]) -> None:
 
 FAULTS: dict[str, tuple[Change, str, str]] = {
     "axes": (opencv_axes, "OpenGL's camera axes", f"{VIEWS} of {VIEWS} views"),
-    "focal length": (wrong_focal, r"focal length of the photographs is 0\.9", f"{VIEWS} of {VIEWS} views"),
     "two exchanged": (two_exchanged, "view images/00[16].png: its pose does not fit", "6 of 8 views"),
 }
 
@@ -144,71 +134,6 @@ def test_repair_of_a_scene_without_faults_writes_nothing(box, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
     assert cli.main(["repair", str(box), f"out={tmp_path / 'repaired.ply'}"]) == 2
     assert "give a name in .json" in capsys.readouterr().err
-
-
-def test_photographs_and_depth_of_two_cameras_are_registered_by_repair(tmp_path, capsys):
-    cameras, beside = few_cameras(8), few_cameras(8, 0.9 * 112)
-    poses = beside.cam_from_world.copy()
-    poses[:, 0, 3] += 0.03
-    write_box(tmp_path / "box", box_views(cameras, color_cameras=replace(beside, cam_from_world=poses)))
-    repaired = tmp_path / "box" / "registered.json"
-    assert cli.main(["repair", str(tmp_path / "box"), f"out={repaired}"]) == 0
-    said(capsys)
-    assert cli.main(["inspect", str(repaired)]) == 0
-    printed = said(capsys)
-    assert "not registered in the files: f = 112 (photographs 100" in printed
-    assert "nothing wrong was seen" in printed
-    views = load_scene(repaired).views
-    np.testing.assert_allclose(views.cameras.Ks[:, 0, 0], 0.9 * 112, rtol=0.005)
-    np.testing.assert_allclose(views.cameras.centers, replace(beside, cam_from_world=poses).centers, atol=0.004)
-
-
-def test_posed_images_that_are_written_are_read_back(box: Path) -> None:
-    posed = read_posed(box)[0]
-    models = [
-        CameraModel(model="SIMPLE_RADIAL", width=160, height=120, params=(100.0, 80.0, 60.0, 0.01)),
-        CameraModel(model="RADIAL", width=160, height=120, params=(100.0, 80.0, 60.0, 0.01, -0.02)),
-        CameraModel(
-            model="FULL_OPENCV",
-            width=160,
-            height=120,
-            params=(100.0, 105.0, 80.0, 60.0, 0.01, -0.02, 0.001, 0.002, 0.003, 0.0, 0.0, 0.0),
-        ),
-        CameraModel(
-            model="OPENCV_FISHEYE", width=160, height=120, params=(100.0, 105.0, 80.0, 60.0, 0.01, 0.02, 0.03, 0.04)
-        ),
-    ]
-    depth_from_color = np.eye(4)
-    depth_from_color[0, 3] = 0.025
-    images = tuple(
-        replace(
-            image,
-            camera=models[view % 4],
-            depth_camera=models[0] if view % 2 else None,
-            depth_from_color=depth_from_color if view % 2 else None,
-            depth_measure="ray" if view % 3 else "z",
-            no_depth=65535 if view % 2 else None,
-        )
-        for view, image in enumerate(posed.images)
-    )
-    written = replace(posed, images=images, metres_per_unit=0.5, up=np.array([0.0, 1.0, 0.0]))
-    path = box / "written.json"
-    path.write_text(json.dumps(transforms_of(written, box)))
-    try:
-        read = read_transforms(path)
-    finally:
-        path.unlink()
-    assert (read.metres_per_unit, read.up is not None and read.up.tolist()) == (0.5, [0, 1, 0])
-    for before, after in zip(images, read.images, strict=True):
-        np.testing.assert_allclose(after.cam_from_world, before.cam_from_world, atol=1e-9)
-        assert after.camera.pinhole_params() == before.camera.pinhole_params()
-        distortion = [value for value in before.camera.params[3:] if value]
-        assert [value for value in after.camera.params[3:] if value][-len(distortion) :] == distortion
-        for name in ("depth_measure", "no_depth", "depth_scale", "image", "depth"):
-            assert getattr(after, name) == getattr(before, name)
-        assert (after.depth_camera is None) == (before.depth_camera is None)
-        if before.depth_from_color is not None:
-            np.testing.assert_array_equal(after.depth_from_color, before.depth_from_color)
 
 
 def test_inspect_of_a_folder_shows_each_scene_and_a_splat_beside_none(box, tmp_path, capsys):

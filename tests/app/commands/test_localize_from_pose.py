@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from asked_rooms import ORIGIN, save_room
+from asked_rooms import ORIGIN
 from command_runs import refusal, results_of
 from PIL import Image
 
@@ -19,13 +19,6 @@ from gsencoder.types.checks import OPENCV_FROM_OPENGL
 pytestmark = pytest.mark.slow
 
 CUBE = ORIGIN + np.array([0.3, 0.2, 0.8])
-
-
-@pytest.fixture(scope="module")
-def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("room") / "features"
-    save_room(folder, step=0.12)
-    return folder
 
 
 def world_pose(features: Path, view: int) -> np.ndarray:

@@ -15,8 +15,6 @@ from splats import random_gaussians
 from training_scenes import SMALL
 
 from gsencoder.app import main as cli
-from gsencoder.app.commands.memory import MemoryCommandConfig
-from gsencoder.app.options import options_by_key
 from gsencoder.core.errors import InputError
 from gsencoder.core.logs import read_log
 from gsencoder.data.splats.files import save_splat
@@ -27,7 +25,7 @@ from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import save_weights
 from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
 from gsencoder.train import memory as training
-from gsencoder.train.memory import fingerprint_of, memory_training
+from gsencoder.train.memory import fingerprint_of
 from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow
@@ -94,8 +92,8 @@ def test_a_memory_of_two_teachers_is_written_with_its_words_and_figures(made: Pa
 def test_localize_views_and_pack_take_a_memory_as_features(made: Path, tmp_path: Path) -> None:
     assert cli.main(["localize", str(made), "query=red", "space=palette", f"out={tmp_path / 'boxes'}"]) == 0
     assert (tmp_path / "boxes" / "boxes.json").is_file()
-    words = ["query=red", "space=palette", f"out={tmp_path / 'views'}", "quiet=true"]
-    assert cli.main(["views", str(made), *words]) == 0
+    words = ["query=red", "space=palette", "choose.candidates=4", "choose.count=2", "choose.width=96"]
+    assert cli.main(["views", str(made), *words, f"out={tmp_path / 'views'}", "quiet=true"]) == 0
     packed = tmp_path / "packed"
     assert cli.main(["pack", str(made), "form=index", "space=labels", f"out={packed}", "quiet=true"]) == 0
     features = load_features(made).features["labels"]
@@ -120,7 +118,7 @@ def test_objects_are_boxed_from_a_memory_as_from_fused_features(room, made, teac
         np.testing.assert_allclose(boxes[1][word]["center"], box["center"], atol=0.05)
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(room, teachers, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_run_goes_on_where_it_stopped(room, teachers, made, tmp_path, monkeypatch, capsys):
     run = training.Trainer.run
 
     def stop_at_ten(self: training.Trainer, track: object) -> None:
@@ -140,16 +138,11 @@ def test_an_interrupted_run_goes_on_where_it_stopped(room, teachers, tmp_path, m
     assert len(read_log(state / "queries" / "log.csv")) == 1
     assert not (tmp_path / "memory").exists()
     assert "a run with the same out= and settings continues it" in capsys.readouterr().err
-    assert "an optimization that is not finished and would be lost" in refusal(
-        capsys, *(word for word in words if word != "quiet=true"), "optimize=false"
-    )
-    with monkeypatch.context() as patch:
-        patch.setattr("gsencoder.train.memory.fuse", unused)
-        assert cli.main(words) == 0
-    whole = ["memory", str(room), *teachers, f"out={tmp_path / 'whole'}", *QUICK]
-    assert cli.main(whole) == 0
+    assert "an optimization that is not finished and would be lost" in refusal(capsys, *words, "optimize=false")
+    monkeypatch.setattr("gsencoder.train.memory.fuse", unused)
+    assert cli.main(words) == 0
     for name in ("labels", "palette"):
-        one, other = (load_memories(tmp_path / folder)[name] for folder in ("memory", "whole"))
+        one, other = (load_memories(folder)[name] for folder in (tmp_path / "memory", made))
         np.testing.assert_array_equal(one.queries, other.queries)
 
 
@@ -230,12 +223,6 @@ def test_settings_and_scenes_that_cannot_be_are_refused_in_one_line(room, tmp_pa
     monkeypatch.setattr("gsencoder.infer.memory_pictures.find_spec", lambda name: None)
     assert "pip install 'gsencoder[umap]'" in refusal(capsys, *palette, "umap=true")
     assert not (tmp_path / "out").exists()
-
-
-def test_the_defaults_that_help_shows_are_those_of_the_command() -> None:
-    options, training = options_by_key(MemoryCommandConfig), memory_training()
-    for name in ("steps", "learning_rate", "warmup", "validate_every"):
-        assert options[f"train.{name}"].default == getattr(training, name)
 
 
 def test_banks_of_as_many_components_have_fingerprints_of_their_own() -> None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 from archives import flip_bit
-from reconstructions import QUICK, interrupt, never, refusal, summary_of
+from command_runs import refusal, results_of
+from reconstructions import QUICK, interrupt, never
 from textured_box import box_cameras
 
 from gsencoder.app import main as cli
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_room_becomes_a_splat_with_a_log_and_pictures(built: Path) -> None:
-    results = summary_of(built)["results"]
+    results = results_of(built)
     assert (results["source"], results["steps"], results["views"], results["held_out"]) == ("depth", 12, 4, 2)
     splat = load_splat(built / results["splat"])
     assert len(splat) == results["gaussians"] > 500
@@ -44,9 +45,9 @@ def test_a_splat_is_refined(room: Path, built: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = [str(room), f"splat={built / 'splat.ply'}", f"out={out}", *QUICK]
     assert cli.main(["reconstruct", *words]) == 0
-    results = summary_of(out)["results"]
+    results = results_of(out)
     assert results["source"] == "splat"
-    assert results["psnr"] > summary_of(built)["results"]["psnr"]
+    assert results["psnr"] > results_of(built)["psnr"]
 
 
 def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(room, built, tmp_path, monkeypatch):
@@ -68,9 +69,9 @@ def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(room, built, tmp_pat
         # With other threads the budget would allow another size of the photographs; that of the first run stays.
         patched.setattr(command, "choose_scale", never)
         assert cli.main(words) == 0
-    results = summary_of(out)["results"]
+    results = results_of(out)
     assert {name: results[name] for name in ("seeds", "source")} == {
-        name: summary_of(built)["results"][name] for name in ("seeds", "source")
+        name: results_of(built)[name] for name in ("seeds", "source")
     }
     splat, whole = load_splat(out / "splat.ply"), load_splat(built / "splat.ply")
     for name in ("means", "quats", "scales", "opacities", "sh"):
@@ -84,33 +85,33 @@ def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(room, built, tmp_pat
 def test_photographs_alone_are_placed_or_refused_in_words(tmp_path, capsys, room):
     alone = tmp_path / "alone"
     alone.mkdir()
-    assert "neither a scene nor a folder of scenes" in refusal(capsys, str(alone))
+    assert "neither a scene nor a folder of scenes" in refusal(capsys, "reconstruct", str(alone))
     for number, path in enumerate(sorted((room / "images").iterdir())[:2]):
         shutil.copy(path, alone / f"{number}{path.suffix}")
-    assert "expected at least 3 photographs" in refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
+    assert "expected at least 3 photographs" in refusal(capsys, "reconstruct", str(alone), f"out={tmp_path / 'out'}")
     from PIL import Image
 
     for number in range(4):
         Image.new("RGB", (80, 60), (60 * number, 90, 20)).save(alone / f"{number}.png")
-    problem = refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
+    problem = refusal(capsys, "reconstruct", str(alone), f"out={tmp_path / 'out'}")
     assert "could be placed" in problem or "cannot place these photographs" in problem
     assert not (tmp_path / "out").exists()
 
 
-def test_photographs_alone_are_placed_once_and_become_a_splat(tmp_path, ten, monkeypatch, capsys):
-    folder, out = shutil.copytree(ten, tmp_path / "photographs"), tmp_path / "out"
-    words = [str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25", "dense.spacing=3"]
-    words += ["sfm.size=400", "sfm.features=2000"]
+def test_photographs_alone_are_placed_once_and_become_a_splat(tmp_path, photographs, monkeypatch, capsys):
+    folder, out = shutil.copytree(photographs, tmp_path / "photographs"), tmp_path / "out"
+    words = ["reconstruct", str(folder), f"out={out}", "quiet=true", "optimize.steps=6", "data.image_scale=0.25"]
+    words += ["sfm.size=400", "sfm.features=2000", "dense.spacing=3"]
     with monkeypatch.context() as patched:
         patched.setattr(reconstruct.Optimizer, "advance", interrupt)
-        assert cli.main(["reconstruct", *words]) == 130
+        assert cli.main(words) == 130
     work = out.with_name("out.reconstruction")
     placed = (work / "placed.json").read_bytes()
     monkeypatch.setattr("gsencoder.reconstruct.sfm.load_pycolmap", never)
     # Places of another placement would put old Gaussians into a new world.
     for damaged in (b"", b'{"asked": 1}', placed.replace(b"grey", b"gray"), b"\xff\xfe"):
         (work / "placed.json").write_bytes(damaged)
-        assert "where its photographs were placed (placed.json, sparse/0) is gone or damaged" in refusal(capsys, *words)
+        assert "photographs were placed (placed.json, sparse/0) is gone or damaged" in refusal(capsys, *words)
     (work / "placed.json").write_bytes(placed)
     for file in sorted((work / "sparse" / "0").iterdir()):
         flip_bit(file, 4 * file.stat().st_size)
@@ -118,28 +119,28 @@ def test_photographs_alone_are_placed_once_and_become_a_splat(tmp_path, ten, mon
         flip_bit(file, 4 * file.stat().st_size)
     os.utime(folder / "grey.jpg", ns=(1, 1))
     assert "belongs to other photographs" in refusal(capsys, *words)
-    shutil.copystat(ten / "grey.jpg", folder / "grey.jpg")
+    shutil.copystat(photographs / "grey.jpg", folder / "grey.jpg")
     capsys.readouterr()
-    assert cli.main(["reconstruct", *words]) == 0
+    assert cli.main(words) == 0
     assert "could not be placed and are not used: grey.jpg" in capsys.readouterr().err
-    results = summary_of(out)["results"]
+    results = results_of(out)
     assert results["missing"] == ["grey.jpg"]
-    assert results["placed"] == 10
+    assert results["placed"] == 6
     assert results["swept"] > results["filled"] / 10 > 0
     assert len(load_splat(out / "splat.ply")) > 5000
     fused = tmp_path / "features"
     scene = [str(out), "splat=splat.ply", f"data.images={folder}", "data.image_scale=0.25", "data.max_views=3"]
     assert cli.main(["fuse", *scene, "teacher=palette", f"out={fused}", "quiet=true"]) == 0
-    assert summary_of(fused)["results"]["seen"] > 1000
+    assert results_of(fused)["seen"] > 1000
     assert "in another; give a scene with the poses" in refusal(
-        capsys, str(folder), f"out={tmp_path / 'refined'}", f"splat={out / 'splat.ply'}"
+        capsys, "reconstruct", str(folder), f"out={tmp_path / 'refined'}", f"splat={out / 'splat.ply'}"
     )
 
 
-def test_photographs_that_cannot_be_placed_are_told_before_any_is(ten, tmp_path, capsys, monkeypatch):
-    words = [str(tmp_path), f"out={tmp_path / 'out'}"]
+def test_photographs_that_cannot_be_placed_are_told_before_any_is(photographs, tmp_path, capsys, monkeypatch):
+    words = ["reconstruct", str(tmp_path), f"out={tmp_path / 'out'}"]
     monkeypatch.setattr("gsencoder.reconstruct.sfm._map", never)
-    for path in sorted(ten.iterdir())[:4]:
+    for path in sorted(photographs.iterdir())[:4]:
         shutil.copy(path, tmp_path)
     assert "sfm.size: expected 64" in refusal(capsys, *words, "sfm.size=99999999999")
     bad = tmp_path / "bad.jpg"
@@ -173,13 +174,13 @@ def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(room, tmp_
     log = out.with_name("out.reconstruction") / "log.csv"
     text = log.read_text()
     log.write_text(text.replace(".", "x"))
-    problem = refusal(capsys, *words)
+    problem = refusal(capsys, "reconstruct", *words)
     assert "log.csv: damaged: could not convert" in problem
     assert problem.endswith("give resume=false to start again")
     log.write_text(text)
     first, second = sorted((scene / "images").iterdir())[:2]
     shutil.copy(second, first)
-    assert "was made with photographs=" in refusal(capsys, *words)
+    assert "was made with photographs=" in refusal(capsys, "reconstruct", *words)
     assert cli.main(["reconstruct", *words, "resume=false"]) == 0
 
 
@@ -196,17 +197,17 @@ def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(room, tmp_
     ],
 )
 def test_what_cannot_be_is_told(room, tmp_path, capsys, words, problem):
-    assert problem in refusal(capsys, str(room), f"out={tmp_path / 'out'}", *words)
+    assert problem in refusal(capsys, "reconstruct", str(room), f"out={tmp_path / 'out'}", *words)
     assert not (tmp_path / "out").exists()
 
 
 def test_every_eighth_photograph_is_kept() -> None:
-    def photographs(count: int) -> Photographs:
+    def posed(count: int) -> Photographs:
         cameras = box_cameras(count, width=8, height=8)
         names = tuple(map(str, range(count)))
         return Photographs(Views(cameras=cameras, names=names, images=[np.zeros((8, 8, 3), np.uint8)] * count))
 
-    assert split(photographs(10), 4) == ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
-    assert split(photographs(3), 0) == ([0, 1, 2], [])
+    assert split(posed(10), 4) == ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
+    assert split(posed(3), 0) == ([0, 1, 2], [])
     with pytest.raises(InputError, match="at least 2 photographs"):
-        split(photographs(2), 2)
+        split(posed(2), 2)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from reconstructions import summary_of
+from command_runs import results_of
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands import reconstruct as command
@@ -54,7 +54,7 @@ def test_seconds_are_counted_from_the_first_reading_to_the_splat_and_all_that_wa
     words = ["holdout=3", "seeds.voxel=0.15", "budget.seconds=506", "budget.megabytes=9"]
     assert cli.main(["reconstruct", str(room), f"out={tmp_path / 'out'}", *words]) == 0
     assert spent_at == {"scale": 30, "fit": 60}
-    results = summary_of(tmp_path / "out")["results"]
+    results = results_of(tmp_path / "out")
     budget = results["budget"]
     assert budget["chosen"] == {"image_scale": 0.5, "steps": 2, "sh_degree": 1}
     assert budget["predicted"] == {"seconds": 400, "megabytes": 0.5}

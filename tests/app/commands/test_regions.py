@@ -10,12 +10,9 @@ from named_rooms import write_words
 from region_scenes import save_colors
 
 from gsencoder.app import main as cli
-from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.compose import compose
 from gsencoder.core.archive import open_archive
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.teachers.regions import RegionsConfig
 from gsencoder.text.table import load_text_table
 
 
@@ -90,9 +87,3 @@ def test_what_is_wrong_is_one_line(room, tmp_path, capsys, monkeypatch, options,
     assert len(lines) == 1
     assert problem in lines[0]
     assert not (tmp_path / "o").exists()
-
-
-def test_the_preset_of_dinov2_means_over_regions() -> None:
-    config = compose("fuse", FuseCommandConfig, ["scene", "teacher=dinov2_regions", "teacher.folder=masks"])
-    assert isinstance(config.teacher, RegionsConfig)
-    assert (config.teacher.vector, config.teacher.onnx.skip_tokens, config.teacher.onnx.patch) == ("map", 1, 14)

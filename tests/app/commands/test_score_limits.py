@@ -1,7 +1,6 @@
 """`gsencoder score` on files with nothing to score, ids of no class, and files that are not what they seem."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -76,18 +75,6 @@ def test_lists_without_an_entry_are_refused(protocol: str, tmp_path: Path, capsy
         capsys, "score", protocol, f"predictions={tmp_path / 'predictions.json'}", f"truth={tmp_path / 'truth.json'}"
     )
     assert "truth.json" in message
-
-
-def test_a_mask_that_is_a_link_to_itself_and_a_pipe_are_refused(tmp_path, capsys):
-    truth = blocks(1001, 0)
-    words = [*instance_files(tmp_path, truth, [(truth == 1001, 1, 0.9)]), f"classes={tmp_path / 'classes.csv'}"]
-    mask = tmp_path / "predictions/masks/0.txt"
-    mask.unlink()
-    mask.symlink_to("0.txt")
-    assert "s.txt: line 1: the mask 'masks/0.txt' cannot be read" in refusal(capsys, *words)
-    mask.unlink()
-    os.mkfifo(mask)
-    assert "is not a regular file" in refusal(capsys, *words)
 
 
 def test_scenes_without_captions_are_refused_or_count_as_empty(tmp_path, capsys):

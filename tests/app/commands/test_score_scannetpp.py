@@ -1,11 +1,10 @@
 """`evaluate` and `score` with ScanNet++'s lists of classes, on a room in its files."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_runs import refusal, results_of
+from command_runs import results_of
 from labeled_scans import ROOM_NAMES, write_scannetpp_scan
 
 from gsencoder.app import main as cli
@@ -53,23 +52,3 @@ def test_scans_and_the_files_that_evaluate_writes_have_one_truth(protocol, home,
         assert first["miou"] > 0.5
         labels = {int(line) for line in (tmp_path / "a" / "truth" / "room.txt").read_text().split()}
         assert {-100, 0} <= labels
-
-
-def test_instances_of_a_class_with_the_id_0_are_refused(home, tmp_path, capsys):
-    (tmp_path / "classes.csv").write_text("id,name\n0,ball\n1,cube\n")
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    files = [f"predictions={tmp_path / 'a'}", f"truth={tmp_path / 'b'}", f"classes={tmp_path / 'classes.csv'}"]
-    line = refusal(capsys, "score", "instances", *files)
-    assert "classes: 'ball' has the id 0, which files of instances cannot hold" in line
-    line = refusal(
-        capsys,
-        "evaluate",
-        str(home / "scans" / "room"),
-        "protocol=instances",
-        files[-1],
-        f"teacher.words={home / 'words.safetensors'}",
-        f"out={tmp_path / 'out'}",
-    )
-    assert "classes: 'ball' has the id 0" in line
-    assert json.dumps(sorted(path.name for path in tmp_path.iterdir())) == '["a", "b", "classes.csv"]'

@@ -98,18 +98,6 @@ def test_labels_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(sc
     assert results["miou"] == pytest.approx((150 / 260 + 1 + 0) / 3)
 
 
-def test_the_200_classes_take_another_column_of_the_label_map(scans: Path, tmp_path: Path) -> None:
-    predictions = tmp_path / "predictions"
-    predictions.mkdir()
-    for scene in ("scene0000_00", "scene0001_00"):
-        # Office chair 10, couch 6, wall 1, paper 43 of ScanNet200.
-        write_whole_numbers(predictions / f"{scene}.txt", np.repeat([10, 6, 1, 79], SIZES))
-    words = words_of("semantics", scans, f"out={tmp_path / 'out'}", "quiet=true", classes="scannet200")
-    assert cli.main(words) == 0
-    results = results_of(tmp_path / "out")
-    assert (results["miou"], results["ignored"]) == (1, 2 * 40)
-
-
 def test_folders_that_do_not_fit_are_refused(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     predictions = write_masks(scans)
     without_map = [word for word in words_of("instances", scans) if not word.startswith("label_map")]

@@ -13,7 +13,7 @@ from gsencoder.app import main as cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.folder import WORDS_FILE, save_features
 from gsencoder.infer.select import find_holes, sample_views, select
-from gsencoder.text.table import TextTable, make_text_table, save_text_table
+from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.types import Scene
 
 SCENE, KINDS = selected_room()
@@ -51,17 +51,6 @@ def test_seeds_and_labels_are_counted_for_each_word(features, tmp_path, capsys):
     np.testing.assert_allclose(part.means, SCENE.gaussians.means[expected.labels == 1], atol=1e-4)
 
 
-def test_words_with_the_names_of_the_commands_files_get_other_files(tmp_path: Path) -> None:
-    table = make_text_table(("labels", "holes", "summary", "lamp"), EMBEDDINGS, "table")
-    folder = stored(tmp_path / "features", table=table)
-    run(folder, "query=labels,holes", f"out={tmp_path / 'out'}", "quiet=true")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "labels_2.ply", "holes_2.ply", "rest.ply", "labels.ply", "labels.json", "holes.json", "summary.json",
-    }  # fmt: skip
-    run(folder, "query=summary", f"out={tmp_path / 'other'}", "quiet=true", "write=objects")
-    assert (tmp_path / "other" / "summary_2.ply").exists()
-
-
 @pytest.mark.parametrize("under", [True, False])
 def test_holes_are_those_of_the_objects_in_each_view(tmp_path, capsys, under):
     scene, _ = selected_room(under=under)
@@ -97,12 +86,3 @@ def test_a_box_that_is_asked_for_and_settings_of_boxes_reach_the_selection(featu
     common = ("select", str(features), "query=mug", f"out={tmp_path / 'none'}")
     assert "no Gaussian of table is selected" in refusal(capsys, *common, "localize.min_weight=1e30")
     assert "siglip" in refusal(capsys, *common, "head=siglip")
-
-
-def test_words_are_printed_on_one_line_in_their_own_direction(tmp_path, capsys):
-    word = "\u202egum"
-    folder = stored(tmp_path / "features", table=make_text_table((word, "book", "table", "lamp"), EMBEDDINGS, "table"))
-    run(folder, f"query={word}", f"out={tmp_path / 'out'}", "write=objects")
-    output = capsys.readouterr().out
-    assert "gum" in output
-    assert "\u202e" not in output

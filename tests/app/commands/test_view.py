@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -51,16 +50,6 @@ def test_a_page_is_written_with_a_summary_of_what_it_holds(folder: Path, built: 
     assert results["photographs"] == [2]
     assert results["gaussians"] == [5156]
     assert 'id="scene-0"' in out.read_text()
-
-
-def test_two_folders_are_two_scenes_of_one_page(folder: Path, built: Path, tmp_path: Path) -> None:
-    out = tmp_path / "page.html"
-    features, copy = folder / "features", tmp_path / "copy"
-    shutil.copytree(features, copy)
-    assert cli.main(["view", str(features), str(copy), f"out={out}", "max_gaussians=1500", "quiet=true"]) == 0
-    results = json.loads(Path(f"{out}.summary.json").read_text())["results"]
-    assert results["gaussians"] == [1500, 1500]
-    assert any("1,500 of 5,156 Gaussians" in note for note in results["left_out"])
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ def posed(count: int = 4, **changes: Any) -> PosedImages:
         images.append(
             PosedImage(name=f"{view}.png", camera=PINHOLE, cam_from_world=pose, image=Path(f"/c/{view}.png"), **image)
         )
-    return PosedImages(source="here", images=tuple(images), metres_per_unit=1.0, up=np.array([0.0, 0, 1]))
+    return PosedImages(source="here", images=tuple(images), metres_per_unit=0.5, up=np.array([0.0, 1, 0]))
 
 
 def finding(cause: str, *, factor: float | None = None, view: str | None = None) -> Finding:
@@ -134,7 +134,8 @@ def test_every_camera_that_can_be_written_is_read_back(tmp_path, name):
     content = transforms_of(replace(scene, images=tuple(images)), tmp_path)
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     read = read_transforms(tmp_path / "transforms.json")
-    assert (read.metres_per_unit, read.up is None) == (1.0, False)
+    assert read.metres_per_unit == 0.5
+    np.testing.assert_array_equal(read.up, [0, 1, 0])
     for back, image in zip(read.images, images, strict=True):
         np.testing.assert_allclose(back.cam_from_world, image.cam_from_world, atol=1e-9)
         assert back.camera.pinhole_params() == camera.pinhole_params()

@@ -83,8 +83,6 @@ def test_nr3d_is_read_as_it_is_published(tmp_path: Path) -> None:
         ([entry(), {"scene_id": "s", "aabb": []}], "entry 1: expected an expression.*got aabb: these are predictions"),
         ([entry(scene_id="../x")], "entry 0: the scene must be a name"),
         ([entry(object_id="x")], "entry 0: object_id must be a whole number from 0, got 'x'"),
-        ([entry(ann_id=None)], "entry 0: ann_id must be a whole number or a text"),
-        ([entry(description="")], "entry 0: description is empty"),
         ([entry(token=["a", 3])], r"entry 0: token\[1\] must be a text, got 3"),
         ([entry(bbox=[[0, 0, 0]])], "entry 0: bbox must be a list of 8 corners"),
         ([entry(), entry()], "entries 0 and 1 have one id: sentence 1 about object 34 of scene0011_00"),
@@ -102,7 +100,6 @@ def test_a_wrong_entry_of_scanrefer_is_named(tmp_path: Path, content: Any, messa
     ("changes", "message"),
     [
         ({"tokens": "__import__('os').getcwd()"}, "line 2: tokens must be a list of words"),
-        ({"tokens": "[" * 9999}, "line 2: tokens must be a list of words"),
         ({"tokens": "[1]"}, r"line 2: tokens\[0\] must be a text"),
         ({"target_id": "8.5"}, "line 2: target_id must be a whole number"),
         ({"utterance": "x" * 200_000}, "not a readable table"),

@@ -167,13 +167,6 @@ def test_what_a_thing_stands_on_is_where_it_is_and_not_next_to_it() -> None:
     )
 
 
-def test_plural_names_are_asked_about_as_such() -> None:
-    questions = texts(thing(1, "scissors", (0, 0, 0)), thing(2, "apple", (0.15, 0, 0)))
-    assert questions["Are there any scissors in the room?"] == ("yes",)
-    assert questions["Where are the scissors?"] == ("next to the apple",)
-    assert not any(text.startswith("How many sci") for text in questions)
-
-
 def test_absent_names_are_those_that_no_label_may_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(made_questions, "ABSENT", ("cup", "guitar", "book", "table"))
     labels = (thing(1, "mug", (0, 0, 0)), thing(2, "book", (3, 0, 0), pixels=0), thing(3, "coffee table", (5, 0, 0)))

@@ -8,7 +8,6 @@ import pytest
 from labeled_scans import group, write_ply, write_scannet_labels, write_scannetpp_labels
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels import scans as segment_files
 from gsencoder.data.labels.mesh import read_mesh
 from gsencoder.data.labels.scans import (
     find_scannet_files,
@@ -132,15 +131,10 @@ def error_of(folder: Path) -> str:
         ({"groups": [group(5, "a", [])]}, "anno", "segGroups[0] (objectId 5): 'a' has no segments"),
         ({"groups": [group(-1, "a", [7])]}, "anno", "segGroups[0]: objectId must be a whole number from 0, got -1"),
         ({"groups": [group(0, "a", [7, True])]}, "anno", "segments[1]: expected a whole number, got True"),
-        ({"groups": [group(2**31 - 1, "a", [7])]}, "anno", "objectId must be a whole number from 0, got 2147483647"),
-        ({"groups": [group(True, "a", [7])]}, "anno", "objectId must be a whole number from 0, got True"),
         ({"groups": [{**group(0, "a", [7]), "label": None}]}, "anno", "label must be a name, got nothing"),
-        ({"groups": [{**group(0, "a", [7]), "segments": "7"}]}, "anno", "segments must be a list"),
         ({"groups": [group(0, "x" * 1001, [7])]}, "anno", "label has 1,001 characters"),
         ({"segments": SEGMENTS[:5]}, "segs", "segIndices has 5 entries, but"),
         ({"segments": [7, 7, 2, 9, 9, "4"]}, "segs", "segIndices[5]: expected a whole number, got '4'"),
-        ({"segments": [7, 7, 2, 9, 9, 2**70]}, "segs", "segIndices[5]: expected a whole number"),
-        ({"segments": []}, "segs", "segIndices is empty"),
         ({"vertices": np.where(np.arange(6)[:, None] == 4, np.inf, VERTICES)}, "mesh", "vertex 4 is not finite (1 of"),
         ({"vertices": VERTICES[:0], "faces": None}, "mesh", "holds no vertices"),
         ({"faces": np.array([[0, 1, 2], [3, 4, 6]])}, "mesh", "face 1 names vertex 6 of 6"),
@@ -160,14 +154,6 @@ def test_json_of_the_wrong_kind_is_refused(tmp_path: Path, content: str, file: s
     path = folder / f"{NAME}{SUFFIXES[file]}"
     path.write_text(content)
     assert str(path) in error_of(folder)
-
-
-def test_gigantic_files_are_refused(tmp_path: Path) -> None:
-    folder = scan(tmp_path)
-    path = folder / f"{NAME}{SUFFIXES['segs']}"
-    with path.open("wb") as stream:
-        stream.truncate(segment_files.MAX_BYTES + 1)
-    assert "536,870,913 bytes; at most 536,870,912 are read" in error_of(folder)
 
 
 @pytest.mark.parametrize("file", SUFFIXES)
@@ -255,9 +241,7 @@ def test_objects_of_scannetpp_count_from_one(tmp_path: Path) -> None:
     [
         ({"instances": np.array([1, 3], np.int32)}, "instances: expected 0 or the id of an object, got 3 in row 1"),
         ({"objects": ((2, "a"), (2, "b"))}, "objects: expected unique ids, got 2 twice"),
-        ({"objects": ((0, "a"),)}, "objects: expected ids from 1, got 0"),
         ({"vertices": np.full((2, 3), np.nan, np.float32)}, "vertices: expected finite"),
-        ({"instances": np.zeros(1, np.int32)}, r"instances: expected int32\[2\]"),
         ({"faces": np.array([[0, 1, 2]], np.int32)}, "faces: expected rows of 2 vertices"),
     ],
 )

@@ -56,14 +56,10 @@ def test_masks_follow_the_folders_of_the_images(field_room, tmp_path):
     content = field_room.copy_photographs(tmp_path)
     names = []
     for number, frame in enumerate(content["frames"]):
-        name = f"camera {number % 2}/{Path(frame['file_path']).name}"
+        name = f"camera_{number % 2}/{Path(frame['file_path']).name}"
         (tmp_path / "images" / name).parent.mkdir(exist_ok=True)
         (tmp_path / frame["file_path"]).rename(tmp_path / "images" / name)
         names.append(name)
-    # pycolmap's text reader ends a name at a blank.
-    names = [name.replace(" ", "_") for name in names]
-    for number in range(2):
-        (tmp_path / "images" / f"camera {number}").rename(tmp_path / "images" / f"camera_{number}")
     for name in names:
         save_mask(tmp_path / "masks" / f"{name}.png")
     masks = masks_of(write_colmap_text(tmp_path, content, names=names))
