@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from asked_rooms import KEY, ORIGIN, ask
+from asked_rooms import KEY, ORIGIN, QUICK, ask
 from chat_server import answer, serving
+from command_runs import refusal
 from PIL import Image
 
 from gsencoder.app import main as cli
@@ -140,10 +141,7 @@ def test_a_question_that_names_nothing_is_shown_even_frames_and_says_so(features
     ],
 )
 def test_what_cannot_be_asked_ends_in_one_line(features, tmp_path, capsys, words, problem):
-    assert ask(features, tmp_path / "out", *words) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1
-    assert problem in lines[0]
+    assert problem in refusal(capsys, "ask", str(features), f"out={tmp_path / 'out'}", "vlm.retries=0", *QUICK, *words)
     assert not (tmp_path / "out").exists()
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_runs import refusal
 from named_rooms import write_words
 from region_scenes import save_colors
 
@@ -82,8 +83,5 @@ def test_scenes_are_prepared_for_training_from_regions(room: Path, tmp_path: Pat
 )
 def test_what_is_wrong_is_one_line(room, tmp_path, capsys, monkeypatch, options, problem):
     monkeypatch.setenv("GSENCODER_MODELS", str(room))
-    assert cli.main(["fuse", str(room), "teacher=regions", *options, f"out={tmp_path / 'o'}", "quiet=true"]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
-    assert len(lines) == 1
-    assert problem in lines[0]
+    assert problem in refusal(capsys, "fuse", str(room), "teacher=regions", *options, f"out={tmp_path / 'o'}")
     assert not (tmp_path / "o").exists()

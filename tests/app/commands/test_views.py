@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from asked_rooms import ORIGIN
+from command_runs import refusal
 from PIL import Image
 
 from gsencoder.app import main as cli
@@ -91,8 +92,5 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(features, tmp_path, capsys, words, problem):
-    assert cli.main(["views", str(features), *words, f"out={tmp_path / 'out'}"]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1
-    assert problem in lines[0]
+    assert problem in refusal(capsys, "views", str(features), *words, f"out={tmp_path / 'out'}")
     assert not (tmp_path / "out").exists()
