@@ -1,6 +1,7 @@
 """A room of Gaussians with a cube in it, that tests of views stand on."""
 
 import numpy as np
+from splats import gaussians_at
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.types import Cameras, Gaussians, Scene, Views
@@ -23,14 +24,7 @@ def sheet(
 
 
 def splat(means: np.ndarray, scale: float | np.ndarray = 0.6 * STEP) -> Gaussians:
-    n = len(means)
-    return Gaussians(
-        means=means.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        scales=np.broadcast_to(np.asarray(scale, np.float32).reshape(-1, 1), (n, 3)).copy(),
-        opacities=np.full(n, 0.99, np.float32),
-        sh=np.random.default_rng(0).normal(size=(n, 1, 3)).astype(np.float32),
-    )
+    return gaussians_at(means, np.reshape(scale, (-1, 1)), 0.99, seed=0)
 
 
 def merged(*parts: Gaussians) -> Gaussians:

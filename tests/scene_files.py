@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from splats import gaussians_at
 
 from gsencoder.data.readers.posed import PosedImage
 from gsencoder.data.readers.undistort import CameraModel
@@ -131,14 +132,7 @@ def write_scannet(folder: Path, count: int = 3, *, depth_size: tuple[int, int] =
 
 
 def some_gaussians(means: np.ndarray, opacities: np.ndarray | None = None, scale: float = 0.01) -> Gaussians:
-    n = len(means)
-    return Gaussians(
-        means=means.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        scales=np.full((n, 3), scale, np.float32),
-        opacities=np.ones(n, np.float32) if opacities is None else opacities.astype(np.float32),
-        sh=np.zeros((n, 1, 3), np.float32),
-    )
+    return gaussians_at(means, scale, 1.0 if opacities is None else opacities)
 
 
 def change(folder: Path, data: dict[str, Any], frame: int = 1, **values: Any) -> Path:

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from splats import gaussians_at
 
 from gsencoder.app.commands.select import LABELS_JSON, LABELS_PLY, PROPERTY
 from gsencoder.data.orbits import looking_cameras
@@ -34,14 +35,7 @@ def shell(center: np.ndarray, half: tuple[float, float, float], rng: np.random.G
 
 
 def splat_of(means: np.ndarray, opacities: np.ndarray | float = 0.99) -> Gaussians:
-    n = len(means)
-    return Gaussians(
-        means=means.astype(np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        scales=np.full((n, 3), 0.6 * STEP, np.float32),
-        opacities=np.broadcast_to(np.float32(opacities), (n,)).copy(),
-        sh=np.random.default_rng(1).normal(size=(n, 1, 3)).astype(np.float32),
-    )
+    return gaussians_at(means, 0.6 * STEP, opacities, seed=1)
 
 
 def circling(center: np.ndarray = MUG, count: int = 8, distance: float = 0.7) -> Cameras:

@@ -1,5 +1,7 @@
 """Small random splats and cameras that several test files stand on."""
 
+from typing import Any
+
 import numpy as np
 
 from gsencoder.render import Blend
@@ -27,17 +29,23 @@ def random_gaussians(
     )
 
 
+def gaussians_at(means: np.ndarray, scales: Any = 0.01, opacities: Any = 1.0, *, seed: int | None = None) -> Gaussians:
+    """Gaussians that are not turned, grey or (`seed`) of random colors."""
+    n = len(means)
+    sh = np.zeros((n, 1, 3)) if seed is None else np.random.default_rng(seed).normal(size=(n, 1, 3))
+    return Gaussians(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        scales=np.broadcast_to(np.asarray(scales, np.float32), (n, 3)).copy(),
+        opacities=np.broadcast_to(np.asarray(opacities, np.float32), (n,)).copy(),
+        sh=sh.astype(np.float32),
+    )
+
+
 def one_gaussian(
     mean: tuple[float, float, float] = (0, 0, 2), scale: float | tuple[float, float, float] = 0.1, opacity: float = 0.8
 ) -> Gaussians:
-    scales = np.broadcast_to(np.asarray(scale, np.float32), (1, 3)).copy()
-    return Gaussians(
-        means=np.array([mean], np.float32),
-        quats=np.array([[1, 0, 0, 0]], np.float32),
-        scales=scales,
-        opacities=np.array([opacity], np.float32),
-        sh=np.zeros((1, 1, 3), np.float32),
-    )
+    return gaussians_at(np.array([mean]), scale, opacity)
 
 
 def front_camera(width: int = 61, height: int = 43, focal: float = 50.0) -> Cameras:

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from splats import gaussians_at
 
 from gsencoder.app.options import CommonConfig
 from gsencoder.app.output import output_folder
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
-from gsencoder.types import Gaussians
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,13 +30,5 @@ def write_toy(config: Any, summary: Any) -> None:
 
 
 def splat(path: Path, count: int = 20) -> Path:
-    rng = np.random.default_rng(0)
-    gaussians = Gaussians(
-        means=rng.normal(size=(count, 3)).astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=np.full((count, 3), 0.1, np.float32),
-        opacities=np.full(count, 0.5, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-    )
-    save_splat(path, gaussians)
+    save_splat(path, gaussians_at(np.random.default_rng(0).normal(size=(count, 3)), 0.1, 0.5))
     return path

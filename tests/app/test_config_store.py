@@ -48,14 +48,17 @@ def union_members(cls: type, prefix: str = "") -> Iterator[tuple[str, type]]:
 
 
 def new_groups(command: str) -> set[str]:
-    """The choices of a command that no command before it has with the same members and the same default."""
+    """The choices of a command that no command before it has with the same members and default, in any section."""
     known: set[tuple[str, tuple[str, ...], str]] = set()
     for name in COMMANDS:
         choices = choices_of(config_of(name))
-        own = {(group, members, choices.chosen[group]) for group, members in choices.groups.items()}
+        own = {
+            group: (group.rpartition("/")[2], members, choices.chosen[group])
+            for group, members in choices.groups.items()
+        }
         if name == command:
-            return {group for group, _, _ in own - known}
-        known |= own
+            return {group for group, choice in own.items() if choice not in known}
+        known |= {*own.values()}
     raise KeyError(command)
 
 

@@ -132,7 +132,8 @@ def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(g
 def test_an_interrupted_command_goes_on_as_if_nothing_had_happened(given, tmp_path, monkeypatch, interrupts):
     from gsencoder.train.loop import TrainerConfig
 
-    assert cli.main(words(given, tmp_path / "whole", "train.steps=6")) == 0
+    more = ("train.steps=6", f"prepared={tmp_path / 'prompts'}")
+    assert cli.main(words(given, tmp_path / "whole", *more)) == 0
     rate_at = TrainerConfig.rate_at
 
     def stop(self: TrainerConfig, step: int, final: float) -> float:
@@ -141,10 +142,10 @@ def test_an_interrupted_command_goes_on_as_if_nothing_had_happened(given, tmp_pa
         return rate_at(self, step, final)
 
     monkeypatch.setattr(TrainerConfig, "rate_at", stop)
-    assert cli.main(words(given, tmp_path / "cut", "train.steps=6")) == 130
+    assert cli.main(words(given, tmp_path / "cut", *more)) == 130
     assert (tmp_path / "cut.training" / "checkpoint.safetensors").is_file()
     monkeypatch.undo()
-    assert cli.main(words(given, tmp_path / "cut", "train.steps=6")) == 0
+    assert cli.main(words(given, tmp_path / "cut", *more)) == 0
     adapters = [(tmp_path / name / "adapter_model.safetensors").read_bytes() for name in ("cut", "whole")]
     assert adapters[0] == adapters[1]
 

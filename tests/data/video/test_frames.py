@@ -2,6 +2,7 @@
 
 import sys
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ def write_video(path: Path, pictures: list[np.ndarray], *, rotation: int = 0, co
     return path
 
 
+@cache
 def pan(count: int = 61, step: float = 6.0) -> list[np.ndarray]:
     """A camera that moves to the side; every third frame is sharp."""
     return [
