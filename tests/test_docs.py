@@ -4,7 +4,6 @@ import ast
 import importlib
 import importlib.util
 import inspect
-import itertools
 import re
 import shlex
 import sys
@@ -15,13 +14,11 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-import yaml
 
 import gsencoder
-from gsencoder.app.compose import Choices, choices_of, named_members, overrides, read_words
+from gsencoder.app.compose import Choices, choices_of, overrides, read_words
 from gsencoder.app.main import COMMANDS
 from gsencoder.core.errors import InputError
-from gsencoder.core.pretrained import find_file
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "gsencoder"
@@ -239,29 +236,6 @@ def test_command_lines_have_commands_options_and_choices_that_are_there(page: Pa
     made_on_the_page = set(re.findall(r'Command\(name="(\w+)"', text_of(page)))
     complaints = [complaint(line, made_on_the_page) for line in command_lines_of(page)]
     assert list(filter(None, complaints)) == []
-
-
-def models_of(line: str) -> Iterator[tuple[str, bool]]:
-    """The models that a command line needs by the names of teachers and towers, and whether they are folders."""
-    command, *words = shlex.split(line, comments=True)
-    if command not in COMMANDS:
-        return
-    _, texts = read_words([word for word in words if re.match(r"(?:teachers?|text)=", word)], choices(command))
-    for key, value in texts.items():
-        for _, member in named_members(value):
-            group = key.removesuffix("s")
-            file = ROOT / "conf" / group / f"{member}.yaml"
-            stated = yaml.safe_load(file.read_text()) if file.is_file() else {}
-            yield from ((stated[name], group == "text") for name in ("model", "classes", "words") if name in stated)
-
-
-@pytest.mark.parametrize("name", ["README.md", "docs/tutorial.md"])
-def test_a_stranger_has_the_models_that_the_first_pages_use(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("GSENCODER_MODELS", raising=False)
-    lines = [line for line in command_lines_of(ROOT / name) if not PLACEHOLDER.match(line)]
-    for model, folder in itertools.chain.from_iterable(map(models_of, lines)):
-        find_file(model, name, folder=folder)
-    assert "GSENCODER_MODELS" not in text_of(ROOT / name)
 
 
 def test_a_wrong_command_line_is_reported() -> None:

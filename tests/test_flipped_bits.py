@@ -35,7 +35,6 @@ from gsencoder.data.labels.files import read_checked
 from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.splats.files import load_splat, save_splat
-from gsencoder.evaluate.tradeoff.measure import RECORDS_FILE, Records
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, CachedTeacher, read_map, write_map
 from gsencoder.fusion.folder import (
     FEATURES_FILE,
@@ -46,18 +45,15 @@ from gsencoder.fusion.folder import (
     save_features,
     save_memories,
 )
-from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, load_heads, save_heads
-from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
+from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_package
 from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers
-from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.reconstruct.parameters import RowAdam, State, anchor_at, load_state, parameters_from, save_state
-from gsencoder.teachers.heads import Head
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE, PreparedDataset
+from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE
 from gsencoder.types import FeatureSpace, Scene, Views
 
 FLIPS = 30
@@ -83,11 +79,6 @@ def features(folder: Path, name: str) -> Made:
 def package(folder: Path, name: str) -> Made:
     save_package(folder, a_scene(), make_features(n=60), error=0.05)
     return folder / name, lambda: load_features(folder)
-
-
-def index_package(folder: Path) -> Made:
-    save_index_package(folder, a_scene(), index_features(make_features(n=60)).features, error=0.05)
-    return folder / PACKAGE_FILE, lambda: load_features(folder)
 
 
 def memory(folder: Path) -> Made:
@@ -120,21 +111,6 @@ def encoder(folder: Path) -> Made:
         return network.config, network.state_dict(), outputs, made_by
 
     return folder / "e", read
-
-
-def heads(folder: Path) -> Made:
-    head = Head(name="clip.summary", body=torch.nn.Sequential(torch.nn.Linear(4, 3)), text="clip", model="ViT-H")
-    one = MeasuredHead(head=head, mean=np.ones(3, np.float32), scale=2.0, cells=3, cosine=0.5, worst=0.25)
-    save_heads(folder / "h", HeadSet(space=an_output_space()["s"].space, heads=(one,)))
-
-    def read() -> Any:
-        made = load_heads(folder / "h")
-        return made.space, [
-            (each.name, each.head.text, each.head.model, each.head.body.state_dict(), each.mean, each.figures())
-            for each in made.heads
-        ]
-
-    return folder / "h", read
 
 
 def prepared_file(folder: Path, name: str) -> Made:
@@ -197,13 +173,11 @@ KINDS: dict[str, Callable[[Path], Made]] = {
     "features": lambda folder: features(folder, FEATURES_FILE),
     "scene of features": lambda folder: features(folder, SCENE_FILE),
     "package": lambda folder: package(folder, PACKAGE_FILE),
-    "package of an index": index_package,
     "memory": memory,
     "splat of a package": lambda folder: package(folder, SPLAT_FILE),
     "words": words,
     "words of another program": words_of_numpy,
     "encoder": encoder,
-    "adapter heads": heads,
     "prepared scene": lambda folder: prepared_file(folder, "scene"),
     "space of prepared scenes": lambda folder: prepared_file(folder, SPACE_FILE),
     "counts of prepared scenes": lambda folder: prepared_file(folder, CLASS_BALANCE_FILE),
@@ -347,18 +321,3 @@ def test_a_summary_without_checksums_says_nothing_of_files(content: str, tmp_pat
         warnings.simplefilter("error")
         check_written(tmp_path / "a")
         check_written(tmp_path / "missing")
-
-
-def test_a_file_of_a_run_that_the_disk_does_not_give_back_is_named(tmp_path: Path) -> None:
-    # Opens like any file, and gives an I/O error at its first byte.
-    bad = Path("/proc/self/mem")
-    if not bad.exists():
-        pytest.skip("needs /proc, as Linux has it")
-    for name in (RECORDS_FILE, SPACE_FILE, "a.txt"):
-        (tmp_path / name).symlink_to(bad)
-    with pytest.raises(InputError, match=r"a\.txt: cannot be read: Input/output error"):
-        checksums_of(tmp_path)
-    with pytest.raises(InputError, match=rf"{RECORDS_FILE}: cannot be read: Input/output error"):
-        Records(tmp_path, {})
-    with pytest.raises(InputError, match=rf"{SPACE_FILE}: .*Input/output error"):
-        PreparedDataset(tmp_path)

@@ -27,7 +27,14 @@ SMALL_MODEL = (
     "model.transformer.decoder_channels=[32]",
     "model.transformer.patch=64",
 )
-QUICK = ("quiet=true", "tensorboard=false", "train.warmup=2", "train.log_every=1", "sampling.views=1")
+QUICK = (
+    "quiet=true",
+    "tensorboard=false",
+    "train.warmup=2",
+    "train.log_every=1",
+    "sampling.views=1",
+    "seeds.voxel=0.08",
+)
 
 
 def composed(*words: str) -> TrainCommandConfig:

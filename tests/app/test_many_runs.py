@@ -28,8 +28,8 @@ def test_many_runs_sweep_numbers_and_keep_text(toy, tmp_path, capsys, monkeypatc
 
 def test_text_is_swept_where_it_is_asked_for(toy: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert cli.main(["toy", "-m", "word=choice(mug,'red, cup')", "size=range(1,3)", f"out={out}", "quiet=true"]) == 0
-    assert [(out / str(k) / "word").read_text() for k in range(4)] == ["mug", "mug", "red, cup", "red, cup"]
+    assert cli.main(["toy", "-m", "word=choice(mug,'red, cup')", f"out={out}", "quiet=true"]) == 0
+    assert [(out / str(k) / "word").read_text() for k in range(2)] == ["mug", "red, cup"]
 
 
 def test_a_failed_run_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ import pytest
 from gsencoder.app.commands.encode import EncodeCommandConfig
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.compose import compose, run_many
+from gsencoder.app.compose import compose
 from gsencoder.app.main import COMMANDS
 from gsencoder.app.options import (
     PRESETS,
@@ -80,14 +80,6 @@ def test_an_unknown_preset_is_an_error_that_lists_them(tmp_path: Path) -> None:
         composed("preset=quick")
     with pytest.raises(InputError, match="^preset: expected one of fast, balanced, exact, got 'quick'"):
         typed(FuseCommandConfig, {"preset": "quick"})
-
-
-def test_presets_can_be_swept(tmp_path: Path) -> None:
-    seen = []
-    words = ["ROOM", "preset=fast,exact", f"out={tmp_path}", "quiet=true"]
-    run_many("fuse", FuseCommandConfig, words, lambda config: seen.append(config) or "")
-    assert [each.preset for each in seen] == ["fast", "exact"]
-    assert [each.fusion for each in seen] == [composed("preset=fast").fusion, composed("preset=exact").fusion]
 
 
 def test_errors_of_budgets_are_held_against_the_exact_preset() -> None:

@@ -57,12 +57,12 @@ def test_fusion_words_and_scores_have_pages_in_which_names_are_text(tmp_path: Pa
     write_room(made, tmp_path / UNSAFE)
     names = sorted({each.name for each in made.objects if each.name})
     save_text_table(tmp_path / "words", make_text_table(names, np.eye(len(names), dtype=np.float32), "room"))
-    common = ["report=true", "quiet=true"]
+    common, seeds = ["report=true", "quiet=true"], "seeds.voxel=0.05"
     scene, teacher = str(tmp_path / UNSAFE), f"teacher.words={tmp_path / 'words'}"
-    assert cli.main(["fuse", scene, teacher, f"out={tmp_path / 'f'}", *common]) == 0
+    assert cli.main(["fuse", scene, teacher, seeds, f"out={tmp_path / 'f'}", *common]) == 0
     words = ",".join(names[:2])
     assert cli.main(["localize", str(tmp_path / "f"), f"query={words}", f"out={tmp_path / 'l'}", *common]) == 0
-    assert cli.main(["evaluate", scene, teacher, "protocol=naming", f"out={tmp_path / 'e'}", *common]) == 0
+    assert cli.main(["evaluate", scene, teacher, seeds, "protocol=naming", f"out={tmp_path / 'e'}", *common]) == 0
     pages = {name: (tmp_path / name / "report.html").read_text() for name in ("f", "l", "e")}
     for name in ("f", "l"):
         assert "&lt;script&gt;alert(1)&lt;" in pages[name]
@@ -79,7 +79,7 @@ def test_fusion_words_and_scores_have_pages_in_which_names_are_text(tmp_path: Pa
     assert set(names) & set(rows)
 
 
-SMALL = ("demo", "objects=2", "views=2", "width=64")
+SMALL = ("demo", "objects=2", "views=2", "width=64", "seeds.voxel=0.1")
 
 
 def test_the_report_links_to_the_page_where_there_is_one(tmp_path, capsys, monkeypatch):

@@ -1,6 +1,5 @@
 """Inspecting and repairing: every defect is found where it was planted, and only what was asked changes."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -145,16 +144,6 @@ def test_a_file_of_nothing_but_nan_is_inspected(tmp_path):
     assert [(defect.name, defect.count) for defect in report.defects if defect.stops_loading] == [("nonfinite", 5)]
     assert report.extent_min is None
     assert report.median_scale is None
-
-
-def test_reports_are_json(tmp_path):
-    raw = put("quats", [3], 0)(samples.make_raw())
-    inspected = json.loads(json.dumps(inspect_splat(raw).to_dict(), allow_nan=False))
-    assert inspected["loadable"] is False
-    assert inspected["defects"] == [{"name": "quats", "count": 1, "first_rows": [3], "stops_loading": True}]
-    _, report = repair_splat(raw, ["quats"])
-    repaired = json.loads(json.dumps(report.to_dict(), allow_nan=False))
-    assert repaired["changes"] == [{"fix": "quats", "count": 1, "action": "set to the identity rotation"}]
 
 
 def surface(count: int = 40, *, step: float = 0.02, scale: float = 0.012) -> RawSplat:
