@@ -38,10 +38,7 @@ def save_room(
     embeddings = np.eye(4, 16, dtype=np.float32)
     space = FeatureSpace(name="names", channels=16, teacher="labels", text_encoder="table")
     features = GaussianFeatures(
-        features=embeddings[kinds],
-        weights=np.ones(n, np.float32),
-        mean=embeddings[kinds].mean(axis=0),
-        space=space,
+        features=embeddings[kinds], weights=np.ones(n, np.float32), mean=embeddings[kinds].mean(axis=0), space=space
     )
     folder.mkdir()
     save_features(folder, replace(scene, name=scene_name, origin=ORIGIN), features, {})

@@ -165,7 +165,7 @@ EXHAUSTIVE: dict[str, Case] = {
         out="out.onnx",
         packages=("onnx", "onnxscript"),
         other=("precision=int8_weights",),
-    ),
+    )
 }
 """Commands that take too long for a test."""
 

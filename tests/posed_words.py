@@ -10,15 +10,7 @@ from splats import random_gaussians
 
 from gsencoder.render import blend
 from gsencoder.text.table import TextTable, make_text_table
-from gsencoder.types import (
-    Cameras,
-    FeatureBasis,
-    FeatureSpace,
-    GaussianFeatures,
-    Gaussians,
-    QueryMemory,
-    Scene,
-)
+from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, QueryMemory, Scene
 from gsencoder.types.features import Scoring
 
 CHANNELS = 40

@@ -54,10 +54,7 @@ def write_transforms(
     frames = []
     for i, pose in enumerate(world_from_cams(count, offset)):
         save(folder / f"images/{i:03d}.png", photograph(i))
-        frame: dict[str, Any] = {
-            "file_path": f"images/{i:03d}.png",
-            "transform_matrix": (pose @ OPENGL).tolist(),
-        }
+        frame: dict[str, Any] = {"file_path": f"images/{i:03d}.png", "transform_matrix": (pose @ OPENGL).tolist()}
         if depth:
             save(folder / f"depth/{i:03d}.png", np.full((24, 32), 1000 + i, np.uint16))
             frame["depth_file_path"] = f"depth/{i:03d}.png"

@@ -12,14 +12,7 @@ from splats import random_cameras
 
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.types import Cameras
-from gsencoder.types.checks import (
-    invert_rigid,
-    look_at,
-    look_rotation,
-    move_origin,
-    perpendicular,
-    transform,
-)
+from gsencoder.types.checks import invert_rigid, look_at, look_rotation, move_origin, perpendicular, transform
 from gsencoder.types.scene import intrinsic_matrix, pixel_centers, project_points, unproject_points
 
 EXTREME = (1e-6, 1.0, 1e6, 1e12)

@@ -51,9 +51,5 @@ def test_a_part_that_raises_is_reported_and_hides_no_other(script, tmp_path, mon
     script["PARTS"].update(chosen)
     code, parts = run(script, monkeypatch, tmp_path / "gpu.md", "--parts", "environment,broken,products")
     assert code == 1
-    assert [each["state"].split(" (")[0] for each in parts] == [
-        "ok",
-        "failed: ValueError: a kernel | was lost",
-        "ok",
-    ]
+    assert [each["state"].split(" (")[0] for each in parts] == ["ok", "failed: ValueError: a kernel | was lost", "ok"]
     assert "| broken | failed: ValueError: a kernel \\| was lost" in (tmp_path / "gpu.md").read_text()

@@ -121,10 +121,7 @@ def test_a_room_a_million_metres_away_gives_the_same_boxes_there(demo: Path, tmp
     np.testing.assert_allclose(corners[1] - shift, corners[0], atol=0.01)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    ["views=0", "objects=1000", "seeds.voxel=0", "localize.threshold.fixed=2"],
-)
+@pytest.mark.parametrize("wrong", ["views=0", "objects=1000", "seeds.voxel=0", "localize.threshold.fixed=2"])
 def test_the_demo_refuses_what_it_cannot_do(wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = refusal(capsys, "demo", wrong, f"out={tmp_path / 'demo'}")
     assert wrong.split("=")[0].split(".")[-1] in line

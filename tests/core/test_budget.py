@@ -91,10 +91,7 @@ def test_an_error_is_bounded_by_the_scatter_of_the_sample() -> None:
     assert error_bound([0.9, 0.1], 1.0) == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("error", 1.0), ("seconds", 0.0), ("megabytes", float("inf"))],
-)
+@pytest.mark.parametrize(("name", "value"), [("error", 1.0), ("seconds", 0.0), ("megabytes", float("inf"))])
 def test_a_limit_that_means_nothing_is_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"^{name}: expected a number"):
         FullBudget(**{name: value})

@@ -50,10 +50,7 @@ def test_slurm_tells_rank_and_size_and_where_to_meet() -> None:
     assert rank_from_environment(environment) == (ProcessRank(), "")
 
 
-@pytest.mark.parametrize(
-    ("nodes", "host"),
-    [("a,b", "a"), ("a[001-200]", "a001"), ("n[2,3].x.org,m", "n2.x.org")],
-)
+@pytest.mark.parametrize(("nodes", "host"), [("a,b", "a"), ("a[001-200]", "a001"), ("n[2,3].x.org,m", "n2.x.org")])
 def test_the_first_machine_of_a_list(nodes: str, host: str) -> None:
     assert first_host(nodes) == host
 

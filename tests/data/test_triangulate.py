@@ -12,10 +12,7 @@ from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.from_photographs import seed_from_photographs, seeds_of_photographs
-from gsencoder.data.seeding.matches import (
-    triangulate,
-    typical_distance,
-)
+from gsencoder.data.seeding.matches import triangulate, typical_distance
 from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
 from gsencoder.types import Scene
 

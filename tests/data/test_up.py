@@ -11,16 +11,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.enclosure import Surfaces, surfaces_of_gaussians
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic import make_room
-from gsencoder.data.up import (
-    Up,
-    _floor_area,
-    _refine,
-    _support,
-    estimate_up,
-    up_of_cameras,
-    up_of_scene,
-    with_up,
-)
+from gsencoder.data.up import Up, _floor_area, _refine, _support, estimate_up, up_of_cameras, up_of_scene, with_up
 from gsencoder.types import Cameras, Gaussians, Scene
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -67,10 +67,7 @@ PROMISES = {name: float(cells[1]) for name, cells in table_rows().items() if nam
 
 
 def routine(
-    name: str,
-    *reads: str,
-    exempt: dict[str, str] | None = None,
-    limits: dict[str, tuple[float, float]] | None = None,
+    name: str, *reads: str, exempt: dict[str, str] | None = None, limits: dict[str, tuple[float, float]] | None = None
 ) -> Callable[[Callable[[Case], float]], Callable[[Case], float]]:
     """Enters a function from a case to an error into the registry."""
 

@@ -48,10 +48,7 @@ def boxes(room: Path, out: Path, *options: str) -> list[dict[str, Any]]:
 def test_regions_are_found_where_labels_are(room: Path, tmp_path: Path) -> None:
     labels = boxes(room, tmp_path / "labels", "teacher=labels")
     assert labels
-    for name, options in (
-        ("instances", ["teacher.masks=instances"]),
-        ("files", ["teacher.folder=masks"]),
-    ):
+    for name, options in (("instances", ["teacher.masks=instances"]), ("files", ["teacher.folder=masks"])):
         regions = boxes(room, tmp_path / name, "teacher=regions", *options)
         assert [box["query"] for box in regions] == [box["query"] for box in labels]
         for ours, theirs in zip(regions, labels, strict=True):

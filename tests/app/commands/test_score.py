@@ -20,12 +20,7 @@ from gsencoder.app import main as cli
 
 sys.exit(cli.main())
 """
-PROTOCOLS = {
-    "recognition": (),
-    "instances": ("protocol.proposals=truth",),
-    "semantics": (),
-    "referring": (),
-}
+PROTOCOLS = {"recognition": (), "instances": ("protocol.proposals=truth",), "semantics": (), "referring": ()}
 
 
 @pytest.fixture(scope="module")

@@ -19,10 +19,7 @@ from gsencoder.data.prompts import PromptStore
 pytest.importorskip("peft")
 transformers = pytest.importorskip("transformers")
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore:`is_gradient_checkpointing`:FutureWarning"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:`is_gradient_checkpointing`:FutureWarning")]
 
 QUICK = (
     "choose.source=frames",

@@ -44,11 +44,7 @@ READERS = {
         ("fuse", "memory", "pack", "several"),
         FEATURES,
     ),
-    "export memory=": (
-        load_memories,
-        ("memory",),
-        "expected a folder with a memory, which `gsencoder memory` writes",
-    ),
+    "export memory=": (load_memories, ("memory",), "expected a folder with a memory, which `gsencoder memory` writes"),
     "weights=": (load_encoder, ("train",), "`gsencoder train` w"),
     "fuse basis=": (load_output_spaces, ("train",), "`gsencoder train` w"),
     "fuse, encode, train, reconstruct, evaluate": (

@@ -7,12 +7,7 @@ import pytest
 from labeled_scans import group, write_scannetpp_labels
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.classes import (
-    ClassTable,
-    ids_of_benchmark,
-    load_classes,
-    read_instance_classes,
-)
+from gsencoder.data.labels.classes import ClassTable, ids_of_benchmark, load_classes, read_instance_classes
 from gsencoder.evaluate.benchmarks.instances import instance_ids_of_scan
 from gsencoder.evaluate.benchmarks.semantics import class_ids_of_scan
 

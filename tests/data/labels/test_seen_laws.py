@@ -9,12 +9,7 @@ import pytest
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.made_questions import (
-    make_expressions,
-    make_questions,
-    make_situations,
-    side_of,
-)
+from gsencoder.data.labels.made_questions import make_expressions, make_questions, make_situations, side_of
 from gsencoder.data.labels.questions import Question, read_questions, write_sqa3d
 from gsencoder.data.labels.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, color_word, see_objects
 from gsencoder.types import Scene, SceneObject, Views
