@@ -16,8 +16,9 @@ from types import ModuleType
 import pytest
 
 import gsencoder
-from gsencoder.app.compose import Choices, choices_of, overrides, read_words
+from gsencoder.app.compose import overrides, read_words
 from gsencoder.app.main import COMMANDS
+from gsencoder.app.options import Choices, choices_of
 from gsencoder.core.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -14,16 +14,17 @@ from typing import Any, get_args, get_origin
 
 import yaml
 
-from gsencoder.app.compose import RULES, choices_of, conf_folder
 from gsencoder.app.main import COMMANDS, FLAGS, SHORT, Command
 from gsencoder.app.options import (
     PRESET,
     PRESETS,
+    RULES,
     CommonConfig,
     Option,
+    choices_of,
+    conf_folder,
     describe,
     field_types,
-    join_list,
     member_name,
     options_of,
     preset_values,
@@ -99,13 +100,11 @@ def escaped(text: str) -> str:
 def shown_default(option: Option) -> str:
     value = option.default
     if value is None or value == "" or value == () or value == {}:
-        return "required" if option.metadata.get("required") else "none" if value is None else "empty"
+        return "required" if option.required else "none" if value is None else "empty"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
     if isinstance(value, (list, tuple)):
-        # Lists of numbers stand in brackets on the command line, lists of text do not.
-        text = join_list(map(str, value)) if option.metadata.get("kind") == "list" else f"[{','.join(map(str, value))}]"
-        return f"`{text}`"
+        return f"`[{','.join(map(str, value))}]`"
     return f"`{value}`"
 
 

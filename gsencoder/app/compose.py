@@ -1,4 +1,4 @@
-"""Composition of a command line into settings by Hydra, with text taken literally, and several runs from one line.
+"""From a command line to settings: Hydra composes them, with text taken literally; also several runs from one line.
 
 Hydra's override grammar is made for numbers and sweeps. In it `query=mug,banana` is a sweep, `question=What's red?` a
 syntax error, `query=1` a number, `query=${oc.env:HOME}` a look-up. Options whose type is text, a path, or a list of
@@ -11,9 +11,8 @@ sections before the last dot where that is unambiguous (`voxel=` for `fusion.vox
 part, the one with the fewest sections before it.
 
 Hydra's config store is filled from a command's settings class. One node holds all defaults of the command; the config
-groups hold what can be chosen by name: the members of choices, presets of sections, `preset`, and `experiment`. YAML
-files in the folder of a group are further members, which set only what differs from the member they build on. The nodes
-are plain dicts: OmegaConf makes a node of a frozen dataclass read-only, and refuses Literal.
+groups (`gsencoder.app.options`) hold what can be chosen by name. The nodes are plain dicts: OmegaConf makes a node of a
+frozen dataclass read-only, and refuses Literal.
 
 With `-m`, values follow Hydra's grammar (`voxel=0.01,0.02`, `teacher=labels,palette`), except for text, which is taken
 literally unless it has the form `query=choice(mug,banana)`. Run k writes to OUT/k; Hydra leaves its `multirun.yaml` in
@@ -22,93 +21,42 @@ OUT.
 
 import os
 import re
-import shutil
 import sys
-import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast, get_args, get_origin
 
 from omegaconf import OmegaConf
 
 from gsencoder.app.options import (
-    DEFAULT_PRESET,
+    EXPERIMENT,
     LIKE_GROUP,
     PRESET,
-    PRESETS,
+    Choices,
     CommonConfig,
     Option,
-    cached,
+    choices_of,
+    conf_folder,
     describe,
     field_types,
-    join_list,
+    groups_of,
+    kind_of,
+    list_items,
     member_name,
     near,
     options_by_key,
-    options_of,
-    preset_values,
     section_classes,
     settings,
-    typed,
+    union_members,
     without_value,
-    wrong_value,
 )
 from gsencoder.core.errors import InputError, one_line
-from gsencoder.core.settings import shown_value
 
-EXPERIMENT = "experiment"
-"""The group whose members set options of several sections; they are merged last, after the command's own defaults and
-presets."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Group:
-    """A config group: named settings of one section, of which a command line chooses one, `KEY=MEMBER`.
-
-    Attributes:
-        key: the section, with a slash before a nested one; also the name of the folder of YAML files.
-        members: the settings of the members that the dataclasses define.
-    """
-
-    key: str
-    default: str
-    members: Mapping[str, dict[str, Any]]
-
-
-@cached
-def groups_of(cls: type[CommonConfig]) -> tuple[Group, ...]:
-    """The config groups of a command, in order of declaration, presets and experiments last."""
-    groups = list(_section_groups(cls()))
-    groups.append(Group(key=PRESET, default=DEFAULT_PRESET, members={name: _preset(cls, name) for name in PRESETS}))
-    if cls.has_experiments:
-        groups.append(Group(key=EXPERIMENT, default="none", members={"none": {}}))
-    return tuple(groups)
-
-
-def _preset(cls: type[CommonConfig], name: str) -> dict[str, Any]:
-    node = OmegaConf.create({PRESET + LIKE_GROUP: name})
-    for key, value in preset_values(cls, name).items():
-        OmegaConf.update(node, key, value)
-    return cast(dict[str, Any], OmegaConf.to_container(node))
-
-
-def _section_groups(config: Any, prefix: str = "") -> Iterator[Group]:
-    annotations = field_types(type(config))
-    for item in fields(config):
-        key, default = prefix + item.name, getattr(config, item.name)
-        classes = section_classes(annotations[item.name])
-        if len(classes) > 1:
-            configs = [default if type(default) is section else section() for section in classes]
-            members = {member_name(type(each)): settings(each) for each in configs}
-            yield Group(key=key, default=member_name(type(default)), members=members)
-        elif "preset" in item.metadata:
-            name = item.metadata["preset"]
-            yield Group(key=key, default=name, members={name: settings(default)})
-        elif classes:
-            yield from _section_groups(default, key + "/")
+T = TypeVar("T")
+Config = TypeVar("Config", bound=CommonConfig)
 
 
 def store_settings(command: str, cls: type[CommonConfig]) -> None:
@@ -134,40 +82,6 @@ def store_settings(command: str, cls: type[CommonConfig]) -> None:
                 inner = inner[section]
             del inner[last]
     store.store(name=command, node={"defaults": [*before, "_self_", *after], **node})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Choices:
-    """The options of a command by full key, and its choices.
-
-    Attributes:
-        members: for each key the members of a choice that have this option; empty if it always applies.
-        groups: the names of each choice's members.
-    """
-
-    options: Mapping[str, Option]
-    members: Mapping[str, tuple[str, ...]]
-    groups: Mapping[str, tuple[str, ...]]
-    chosen: Mapping[str, str]
-
-
-def conf_folder() -> Path:
-    """The folder of YAML files: inside an installed package, beside it in a source tree."""
-    package = Path(__file__).resolve().parents[1]
-    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
-
-
-def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
-    """The options and choices of a command, including the members of choices that are YAML files in `conf`."""
-    folder, groups, defaults = conf or conf_folder(), {}, {}
-    for group in groups_of(cls):
-        files = (path.stem for path in (folder / group.key).glob("*.yaml"))
-        groups[group.key] = tuple(sorted({*group.members, *files}))
-        defaults[group.key] = group.default
-    members: dict[str, tuple[str, ...]] = {}
-    for option in options_of(cls):
-        members[option.key] = (*members.get(option.key, ()), option.member) if option.member else ()
-    return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=defaults)
 
 
 def option_of_several(key: str, choices: Choices) -> Option | None:
@@ -273,8 +187,6 @@ def hydra_error(error: Exception, texts: Mapping[str, str], choices: Choices) ->
     return f"{key}: is an option of {' and '.join(owners)}, and {name} is {single}={member}"
 
 
-Config = TypeVar("Config", bound=CommonConfig)
-
 SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
 """Form of the value of a text option that is swept, with -m."""
 
@@ -305,6 +217,30 @@ def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iter
             yield GlobalHydra.instance().hydra
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(" ".join(str(error).split())) from error
+
+
+def split_list(text: str) -> tuple[str, ...]:
+    """Splits a list of text: commas separate items, `\\,` is a comma; the empty text is the empty list."""
+    return tuple(item.replace("\\,", ",") for item in re.split(r"(?<!\\),", text)) if text else ()
+
+
+def join_list(items: Iterable[str]) -> str:
+    """The text that `split_list` splits into these items."""
+    return ",".join(item.replace(",", "\\,") for item in items)
+
+
+def wrong_value(option: Option, value: Any) -> str:
+    """The message for a value of the wrong type."""
+    if isinstance(value, (list, tuple)) and option.kind == "list":
+        value = join_list(map(str, value))
+    members = union_members(option.annotation)
+    words = [each for member in members for each in (member, *list_items(member)) if get_origin(each) is Literal]
+    hint = near(str(value), [str(word) for each in words for word in get_args(each)])
+    is_list = any(get_origin(member) is tuple for member in members)
+    if is_list and option.kind == "value" and isinstance(value, str) and "," in value:
+        hint = f"; a list of numbers stands in brackets: {option.key}=[{value}]"
+    meaning = f" ({option.help})" if option.help and not hint else ""
+    return f"{option.key}: expected {describe(option.annotation)}, got {value!r}{hint}{meaning}"
 
 
 def read_words(
@@ -397,7 +333,7 @@ def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False
                 # Users of Hydra write brackets around a list; text may begin with one, names do not.
                 bracketed = option.names and re.fullmatch(r"\[(.*)\]", value)
                 text = encode_text(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
-        elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
+        elif option is not None and not sweep and get_origin(option.annotation) is tuple and not value.startswith("["):
             text = f"[{value}]"
         # An option of several members has its key, whatever option of a single one it stands for.
         name = choices.options[key].hydra_key if key in choices.options and key not in choices.groups else key
@@ -413,8 +349,81 @@ def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False
     return hydra_overrides
 
 
-def _is_list(option: Option) -> bool:
-    return getattr(option.annotation, "__origin__", None) is tuple
+def _number(target: type, accepted: tuple[type, ...]) -> Any:
+    """A dacite hook that converts numbers of the accepted types to `target`, and refuses all else, and NaN."""
+    from dacite.exceptions import WrongTypeError
+
+    def convert(value: Any) -> Any:
+        if not isinstance(value, accepted) or isinstance(value, bool) or value != value:
+            raise WrongTypeError(field_type=target, value=value)
+        return target(value)
+
+    return convert
+
+
+def _prepare(value: Any, annotation: Any) -> Any:
+    """Splits text of lists, makes a list of a single value where one is expected, and None of an empty path."""
+    if value is None:
+        return None
+    if isinstance(value, str) and kind_of(annotation) == "list":
+        return split_list(value)
+    members = union_members(annotation)
+    if all(get_origin(member) is tuple for member in members) and not isinstance(value, (list, tuple, dict)):
+        return (value,)
+    return None if value == "" and Path in members and type(None) in get_args(annotation) else value
+
+
+def _section(annotation: Any, value: Any, key: str) -> Any:
+    if get_origin(annotation) is Mapping and section_classes(get_args(annotation)[1]):
+        if not isinstance(value, Mapping):
+            raise InputError(f"{key}: expected settings by name ({key}.NAME.OPTION=…), got {value!r}")
+        return {str(name): _section(get_args(annotation)[1], each, f"{key}.{name}") for name, each in value.items()}
+    classes = section_classes(annotation)
+    if not classes or (value is None and type(None) in get_args(annotation)):
+        return value
+    if not isinstance(value, Mapping):
+        raise InputError(f"{key}: is a section with options of its own ({key}.NAME=…), got {value!r}")
+    if len(classes) == 1:
+        return typed(classes[0], value, key + ".")
+    by_name = {member_name(section): section for section in classes}
+    name = str(value.get("name"))
+    if name not in by_name:
+        raise InputError(f"{key}.name: expected one of {', '.join(by_name)}, got {name!r}{near(name, by_name)}")
+    return typed(by_name[name], value, key + ".")
+
+
+def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
+    """Builds settings from plain dicts, lists and scalars; missing options have their defaults."""
+    import dacite
+    from dacite.exceptions import DaciteFieldError
+
+    types = field_types(cls)
+    values: dict[str, Any] = {}
+    for name, value in data.items():
+        if name not in types:
+            raise InputError(f"{prefix}{name}: no such option{near(prefix + name, [prefix + each for each in types])}")
+        values[name] = _prepare(_section(types[name], value, prefix + name), types[name])
+    hooks: dict[Any, Any] = {
+        int: _number(int, (int,)),
+        float: _number(float, (int, float)),
+        Path: lambda value: Path(value) if isinstance(value, str) and value else value,
+    }
+    try:
+        return dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
+    except DaciteFieldError as error:
+        name = str(error.field_path).partition(".")[0]
+        raise InputError(wrong_value(options_by_key(cls, prefix)[prefix + name], data.get(name))) from error
+    except InputError as error:
+        raise InputError(_named(str(error), prefix, types)) from error
+
+
+def _named(message: str, prefix: str, names: Iterable[str]) -> str:
+    """The message of an error of a settings class, with the name of the section before that of each field."""
+    head, _, problem = message.partition(":")
+    named = re.split(r"(, | and )", head)
+    if not prefix or any(name.split("[")[0] not in names for name in named[::2]):
+        return f"{prefix.rstrip('.')}: {message}" if prefix else message
+    return f"{''.join(prefix + word if index % 2 == 0 else word for index, word in enumerate(named))}:{problem}"
 
 
 def compose(
@@ -444,69 +453,6 @@ def plain_settings(composed: Any) -> dict[str, Any]:
     own = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
     data = cast(dict[str, Any], OmegaConf.to_container(own, resolve=True))
     return {key.removesuffix(LIKE_GROUP): value for key, value in data.items()}
-
-
-RULES = (
-    "A word KEY=VALUE is a setting if KEY is one of those above (the part after the last dot is enough where only one, "
-    "or one with fewer dots than the others, has it), else a path if such a file exists; every other word is a path, "
-    "and so is every word after --. In lists of text commas separate and \\, is a comma."
-)
-
-
-def _shown(value: Any) -> str:
-    if value == "":
-        return "empty"
-    if isinstance(value, tuple):
-        return join_list(map(str, value)) or "none"
-    return str(value).lower() if isinstance(value, bool) or value is None else str(value)
-
-
-def _entry(head: str, text: str, width: int) -> list[str]:
-    body = textwrap.wrap(text, width - 6) or [""]
-    return [f"  {head}", *(f"      {line}" for line in body)]
-
-
-def _option(option: Option, width: int) -> list[str]:
-    kind = option.metavar or describe(option.annotation)
-    return _entry(f"{option.key}={kind}", f"{option.help} [{_shown(option.default)}]", width)
-
-
-def command_help(
-    name: str, summary: str, cls: type[CommonConfig], flags: Mapping[str, str], conf: Path | None = None
-) -> str:
-    """The help of one command: usage, paths, settings with type, meaning and default, choices, flags."""
-    width = min(shutil.get_terminal_size((100, 24)).columns, 110)
-    # The options of the command first, then those of its sections.
-    options = sorted(options_of(cls), key=lambda option: "." in option.key)
-    choices = choices_of(cls, conf)
-    paths = next((option for option in options if option.key == "paths"), None)
-    word = f" {paths.metavar or 'PATH'}…" if paths else ""
-    lines = [f"usage: gsencoder {name}{word} [key=value …]", "", *textwrap.wrap(summary, width)]
-    if paths:
-        lines += ["", "paths:", *_entry(paths.metavar or "PATH", paths.help, width)]
-    groups = {group: members for group, members in choices.groups.items() if group != PRESET}
-    if groups:
-        lines += ["", "choices:"]
-        for group, members in groups.items():
-            text = next((str(each.metadata.get("help", "")) for each in fields(cls) if each.name == group), "")
-            meaning = f"{text} [{_shown(choices.chosen[group])}]".strip()
-            lines += _entry(f"{group}={'|'.join(members)}", meaning, width)
-    lines += ["", f"presets [{DEFAULT_PRESET}]:"]
-    for preset in PRESETS:
-        changes = ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, preset).items())
-        nothing = "the defaults" if preset == DEFAULT_PRESET else "changes nothing in this command"
-        lines += _entry(f"{PRESET}={preset}", changes or nothing, width)
-    lines += ["", "settings [default]:"]
-    for option in options:
-        if option.key != "paths" and not option.member and option.key not in choices.groups:
-            lines += _option(option, width)
-    for member in dict.fromkeys(option.member for option in options if option.member):
-        lines += ["", f"settings with {member} [default]:"]
-        for option in options:
-            if option.member == member:
-                lines += _option(option, width)
-    lines += ["", "flags:", *(f"  {flag:<12}{text}" for flag, text in flags.items())]
-    return "\n".join([*lines, "", *textwrap.wrap(RULES, width)])
 
 
 # A launcher that runs jobs in other processes imports this module there before it resolves the settings.

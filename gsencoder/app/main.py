@@ -22,7 +22,7 @@ from functools import partial
 from typing import Any
 
 import gsencoder
-from gsencoder.app.options import CommonConfig, check_required, near, settings, without_value
+from gsencoder.app.options import CommonConfig, check_required, command_help, near, settings, without_value
 from gsencoder.core.errors import InputError, SceneWarning, clipped, one_line, printable
 from gsencoder.core.process import Stopped, refuse_several, stop_of, stopping_signals
 
@@ -236,11 +236,12 @@ def _dispatch(words: Sequence[str], began: float) -> int:
         raise InputError(f"{bare_name}: no such command{near(bare_name, COMMANDS)} (gsencoder --help lists them)")
     command = COMMANDS[name]
     cls, _ = command.load()
-    from gsencoder.app.compose import command_help, compose, run_many
-
     if "--help" in flags:
         print(command_help(command.name, command.help, cls, FLAGS))
         return 0
+    # It needs Hydra, which takes a while to load.
+    from gsencoder.app.compose import compose, run_many
+
     if "--multirun" in flags:
         if "--cfg" in flags:
             raise InputError("--cfg: shows one run; leave out -m")
@@ -263,8 +264,8 @@ def _run(command: Command, config: Any, debug: bool, began: float | None = None)
     if not command.several:
         together = ", ".join(each.name for each in COMMANDS.values() if each.several)
         refuse_several(command.name, f"start it once; {together} are the commands that processes run together")
-    cls, run_command = command.load()
-    check_required(cls, config)
+    _, run_command = command.load()
+    check_required(config)
     run = Run(command.name, config, began)
     refuse_to_replace_inputs(config.out, run.settings)
     with _collected_warnings(run.add_warning, debug), _impossible_sizes():

@@ -1,4 +1,4 @@
-"""The options of a command: a frozen dataclass, into which command lines and YAML files are parsed and validated.
+"""The options of a command, which are the fields of a frozen dataclass, and its choices; `--help` shows both.
 
 A field is made by `option`, whose metadata hold its meaning and its limits. Further metadata: `required=True` (the
 command cannot run without it), `metavar` (the word that stands for the value in the help), `secret=True` (the value is
@@ -10,20 +10,25 @@ a union of dataclasses is a choice, written `section=member`: every member has a
 `preset="NAME"` in the metadata of a section makes it a choice too, between its default, which has that name, and the
 files `conf/SECTION/*.yaml`. A mapping from names to such a union, with `several="SECTION"`, takes several members of
 that choice: `sections=member,NAME:member`, whose options are `sections.NAME.option=value`.
+
+The config groups of a command hold what can be chosen by name: the members of choices, presets of sections, `preset`,
+and `experiment`. YAML files in the folder of a group are further members, which set only what differs from the member
+that they build on.
 """
 
 import difflib
-import re
+import shutil
+import textwrap
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import CheckedConfig, option, value_at
+from gsencoder.core.settings import CheckedConfig, option, shown_value
 
 Kind = Literal["text", "list", "value"]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -41,47 +46,24 @@ class Option:
     Attributes:
         key: its full name, with dots between sections.
         member: the member of a choice that it belongs to, such as "teacher=onnx"; empty if it always applies.
-        metadata: of its field; see the head of this module.
+        kind: whether its value is taken literally ("text", "list" of text) or parsed by Hydra ("value").
+        names: whether it is a list of words, around which users of Hydra may write brackets.
+        several: the choice of which it takes several members, by name; empty for other options.
+        hydra_key: its name in the settings that Hydra composes.
     """
 
     key: str
     annotation: Any
     default: Any
     member: str
-    metadata: Mapping[str, Any]
-
-    @property
-    def help(self) -> str:
-        return str(self.metadata.get("help", ""))
-
-    @property
-    def metavar(self) -> str:
-        return str(self.metadata.get("metavar", ""))
-
-    @property
-    def secret(self) -> bool:
-        return bool(self.metadata.get("secret"))
-
-    @property
-    def several(self) -> str:
-        """The choice of which it takes several members, by name; empty for other options."""
-        return str(self.metadata.get("several", ""))
-
-    @property
-    def names(self) -> bool:
-        """Whether it is a list of words, around which users of Hydra may write brackets."""
-        items = list_items(self.annotation)
-        return bool(self.metadata.get("names")) or (len(items) == 1 and _is_word(items[0]))
-
-    @property
-    def kind(self) -> Kind:
-        """Whether its value is taken literally ("text", "list" of text) or parsed by Hydra ("value")."""
-        return kind_of(self.annotation)
-
-    @property
-    def hydra_key(self) -> str:
-        """Its name in the settings that Hydra composes."""
-        return self.key + LIKE_GROUP if self.metadata.get("like_group") else self.key
+    kind: Kind
+    help: str
+    metavar: str
+    required: bool
+    secret: bool
+    names: bool
+    several: str
+    hydra_key: str
 
 
 LIKE_GROUP = "__option"
@@ -124,7 +106,7 @@ def list_items(annotation: Any) -> tuple[Any, ...]:
 
 
 def kind_of(annotation: Any) -> Kind:
-    """The kind of an option of a type; see `Option.kind`."""
+    """The kind of an option of a type; see `Option`."""
     members = union_members(annotation)
     if all(member in (str, Path) for member in members):
         return "text"
@@ -156,16 +138,6 @@ def describe(annotation: Any) -> str:
     return " or ".join(words)
 
 
-def split_list(text: str) -> tuple[str, ...]:
-    """Splits a list of text: commas separate items, `\\,` is a comma; the empty text is the empty list."""
-    return tuple(item.replace("\\,", ",") for item in re.split(r"(?<!\\),", text)) if text else ()
-
-
-def join_list(items: Iterable[str]) -> str:
-    """The text that `split_list` splits into these items."""
-    return ",".join(item.replace(",", "\\,") for item in items)
-
-
 @cached
 def field_types(cls: type) -> Mapping[str, Any]:
     """The resolved types of a dataclass's fields."""
@@ -178,38 +150,41 @@ def section_classes(annotation: Any) -> tuple[type, ...]:
     return tuple(member for member in union_members(annotation) if is_dataclass(member) and isinstance(member, type))
 
 
-def mapped_classes(annotation: Any) -> tuple[type, ...]:
-    """The dataclasses of the values of a mapping by name; empty for other options."""
-    return section_classes(get_args(annotation)[1]) if get_origin(annotation) is Mapping else ()
-
-
 def member_name(member: type) -> str:
     """The name of a member of a choice: the literal of its field `name`."""
     return str(get_args(field_types(member)["name"])[0])
 
 
-def _default(item: Any) -> Any:
-    if item.default is not MISSING:
-        return item.default
-    return item.default_factory() if item.default_factory is not MISSING else None
-
-
 def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = None) -> list[Option]:
     """Every option of a settings class, sections included, in order of declaration; `defaults` is an instance whose
-    values are the defaults."""
+    values are the defaults, None = `cls()`."""
     options: list[Option] = []
     annotations = field_types(cls)
+    defaults = cls() if defaults is None else defaults
     for item in fields(cls):
         key, annotation = prefix + item.name, annotations[item.name]
-        default = _default(item) if defaults is None else getattr(defaults, item.name)
-        classes = section_classes(annotation)
+        default, classes = getattr(defaults, item.name), section_classes(annotation)
         if classes:
             for section in classes:
                 owner = f"{key.replace('.', '/')}={member_name(section)}" if len(classes) > 1 else member
                 options += options_of(section, key + ".", owner, default if isinstance(default, section) else None)
         elif not (item.name == "name" and get_origin(annotation) is Literal and len(get_args(annotation)) == 1):
+            metadata, items = item.metadata, list_items(annotation)
             options.append(
-                Option(key=key, annotation=annotation, default=default, member=member, metadata=item.metadata)
+                Option(
+                    key=key,
+                    annotation=annotation,
+                    default=default,
+                    member=member,
+                    kind=kind_of(annotation),
+                    help=metadata.get("help", ""),
+                    metavar=metadata.get("metavar", ""),
+                    required=metadata.get("required", False),
+                    secret=metadata.get("secret", False),
+                    names=metadata.get("names", False) or (len(items) == 1 and _is_word(items[0])),
+                    several=metadata.get("several", ""),
+                    hydra_key=key + LIKE_GROUP if metadata.get("like_group") else key,
+                )
             )
     return options
 
@@ -221,20 +196,6 @@ def options_by_key(cls: type, prefix: str = "") -> Mapping[str, Option]:
     for each in options_of(cls, prefix):
         options.setdefault(each.key, each)
     return options
-
-
-def wrong_value(option: Option, value: Any) -> str:
-    """The message for a value of the wrong type."""
-    if isinstance(value, (list, tuple)) and option.kind == "list":
-        value = join_list(map(str, value))
-    members = union_members(option.annotation)
-    words = [each for member in members for each in (member, *list_items(member)) if get_origin(each) is Literal]
-    hint = near(str(value), [str(word) for each in words for word in get_args(each)])
-    is_list = any(get_origin(member) is tuple for member in members)
-    if is_list and option.kind == "value" and isinstance(value, str) and "," in value:
-        hint = f"; a list of numbers stands in brackets: {option.key}=[{value}]"
-    meaning = f" ({option.help})" if option.help and not hint else ""
-    return f"{option.key}: expected {describe(option.annotation)}, got {value!r}{hint}{meaning}"
 
 
 Preset = Literal["fast", "balanced", "exact"]
@@ -271,8 +232,6 @@ def preset_values(cls: type, preset: str) -> dict[str, Any]:
     """What a preset sets in a command, by full key."""
     return {key: value for key, value in PRESETS[preset].items() if key in options_by_key(cls)}
 
-
-T = TypeVar("T")
 
 HIDDEN = "(not shown)"
 """Shown and written in place of the value of a secret option."""
@@ -339,91 +298,6 @@ class QueriesConfig(FeaturesConfig):
     queries: str = option("", "a text file with one query a line")
 
 
-def _number(target: type, accepted: tuple[type, ...]) -> Any:
-    """A dacite hook that converts numbers of the accepted types to `target`, and refuses all else, and NaN."""
-    from dacite.exceptions import WrongTypeError
-
-    def convert(value: Any) -> Any:
-        if not isinstance(value, accepted) or isinstance(value, bool) or value != value:
-            raise WrongTypeError(field_type=target, value=value)
-        return target(value)
-
-    return convert
-
-
-def _prepare(value: Any, annotation: Any) -> Any:
-    """Splits text of lists, makes a list of a single value where one is expected, and None of an empty path."""
-    if value is None:
-        return None
-    if isinstance(value, str) and kind_of(annotation) == "list":
-        return split_list(value)
-    members = union_members(annotation)
-    if all(get_origin(member) is tuple for member in members) and not isinstance(value, (list, tuple, dict)):
-        return (value,)
-    return None if value == "" and Path in members and type(None) in get_args(annotation) else value
-
-
-def _section(annotation: Any, value: Any, key: str) -> Any:
-    if mapped_classes(annotation):
-        if not isinstance(value, Mapping):
-            raise InputError(f"{key}: expected settings by name ({key}.NAME.OPTION=…), got {value!r}")
-        return {str(name): _section(get_args(annotation)[1], each, f"{key}.{name}") for name, each in value.items()}
-    classes = section_classes(annotation)
-    if not classes or (value is None and type(None) in get_args(annotation)):
-        return value
-    if not isinstance(value, Mapping):
-        raise InputError(f"{key}: is a section with options of its own ({key}.NAME=…), got {value!r}")
-    if len(classes) == 1:
-        return typed(classes[0], value, key + ".")
-    by_name = {member_name(section): section for section in classes}
-    name = str(value.get("name"))
-    if name not in by_name:
-        raise InputError(f"{key}.name: expected one of {', '.join(by_name)}, got {name!r}{near(name, by_name)}")
-    return typed(by_name[name], value, key + ".")
-
-
-def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
-    """Builds settings from plain dicts, lists and scalars; missing options have their defaults."""
-    import dacite
-    from dacite.exceptions import DaciteFieldError
-
-    types = field_types(cls)
-    values: dict[str, Any] = {}
-    for name, value in data.items():
-        if name not in types:
-            raise InputError(f"{prefix}{name}: no such option{near(prefix + name, [prefix + each for each in types])}")
-        values[name] = _prepare(_section(types[name], value, prefix + name), types[name])
-    hooks: dict[Any, Any] = {
-        int: _number(int, (int,)),
-        float: _number(float, (int, float)),
-        Path: lambda value: Path(value) if isinstance(value, str) and value else value,
-    }
-    try:
-        return dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
-    except DaciteFieldError as error:
-        name = str(error.field_path).partition(".")[0]
-        raise InputError(wrong_value(options_by_key(cls, prefix)[prefix + name], data.get(name))) from error
-    except InputError as error:
-        raise InputError(_named(str(error), prefix, types)) from error
-
-
-def _named(message: str, prefix: str, names: Iterable[str]) -> str:
-    """The message of an error of a settings class, with the name of the section before that of each field."""
-    head, _, problem = message.partition(":")
-    named = re.split(r"(, | and )", head)
-    if not prefix or any(name.split("[")[0] not in names for name in named[::2]):
-        return f"{prefix.rstrip('.')}: {message}" if prefix else message
-    return f"{''.join(prefix + word if index % 2 == 0 else word for index, word in enumerate(named))}:{problem}"
-
-
-def check_required(cls: type, config: object) -> None:
-    """Raises an InputError about the first required option that is empty."""
-    for each in options_of(cls):
-        if each.metadata.get("required") and not each.member and value_at(config, each.key) in (None, "", ()):
-            name = f"{each.metavar or 'PATH'}" if each.key == "paths" else f"{each.key}="
-            raise InputError(f"{name} is missing: {each.help}")
-
-
 def settings(config: object) -> dict[str, Any]:
     """The settings as plain values for YAML and JSON; values of secret options are hidden."""
 
@@ -442,3 +316,164 @@ def settings(config: object) -> dict[str, Any]:
         return str(value) if isinstance(value, Path) else value
 
     return plain(config)
+
+
+EXPERIMENT = "experiment"
+"""The group whose members set options of several sections; they are merged last, after the command's own defaults and
+presets."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Group:
+    """A config group: named settings of one section, of which a command line chooses one, `KEY=MEMBER`.
+
+    Attributes:
+        key: the section, with a slash before a nested one; also the name of the folder of YAML files.
+        members: the settings of the members that the dataclasses define.
+    """
+
+    key: str
+    default: str
+    members: Mapping[str, dict[str, Any]]
+
+
+@cached
+def groups_of(cls: type[CommonConfig]) -> tuple[Group, ...]:
+    """The config groups of a command, in order of declaration, presets and experiments last."""
+    groups = list(_section_groups(cls()))
+    groups.append(Group(key=PRESET, default=DEFAULT_PRESET, members={name: _preset(cls, name) for name in PRESETS}))
+    if cls.has_experiments:
+        groups.append(Group(key=EXPERIMENT, default="none", members={"none": {}}))
+    return tuple(groups)
+
+
+def _preset(cls: type[CommonConfig], name: str) -> dict[str, Any]:
+    node: dict[str, Any] = {PRESET + LIKE_GROUP: name}
+    for key, value in preset_values(cls, name).items():
+        *sections, last = key.split(".")
+        section = node
+        for each in sections:
+            section = section.setdefault(each, {})
+        section[last] = value
+    return node
+
+
+def _section_groups(config: Any, prefix: str = "") -> Iterator[Group]:
+    annotations = field_types(type(config))
+    for item in fields(config):
+        key, default = prefix + item.name, getattr(config, item.name)
+        classes = section_classes(annotations[item.name])
+        if len(classes) > 1:
+            configs = [default if type(default) is section else section() for section in classes]
+            members = {member_name(type(each)): settings(each) for each in configs}
+            yield Group(key=key, default=member_name(type(default)), members=members)
+        elif "preset" in item.metadata:
+            name = item.metadata["preset"]
+            yield Group(key=key, default=name, members={name: settings(default)})
+        elif classes:
+            yield from _section_groups(default, key + "/")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """The options of a command by full key, and its choices.
+
+    Attributes:
+        members: for each key the members of a choice that have this option; empty if it always applies.
+        groups: the names of each choice's members.
+    """
+
+    options: Mapping[str, Option]
+    members: Mapping[str, tuple[str, ...]]
+    groups: Mapping[str, tuple[str, ...]]
+    chosen: Mapping[str, str]
+
+
+def conf_folder() -> Path:
+    """The folder of YAML files: inside an installed package, beside it in a source tree."""
+    package = Path(__file__).resolve().parents[1]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
+    """The options and choices of a command, including the members of choices that are YAML files in `conf`."""
+    folder, groups, defaults = conf or conf_folder(), {}, {}
+    for group in groups_of(cls):
+        files = (path.stem for path in (folder / group.key).glob("*.yaml"))
+        groups[group.key] = tuple(sorted({*group.members, *files}))
+        defaults[group.key] = group.default
+    members: dict[str, tuple[str, ...]] = {}
+    for each in options_of(cls):
+        members[each.key] = (*members.get(each.key, ()), each.member) if each.member else ()
+    return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=defaults)
+
+
+def check_required(config: Any) -> None:
+    """Raises an InputError about the first required option that is empty."""
+    for item in fields(config):
+        if item.metadata.get("required") and getattr(config, item.name) in (None, "", ()):
+            name = item.metadata.get("metavar", "PATH") if item.name == "paths" else f"{item.name}="
+            raise InputError(f"{name} is missing: {item.metadata['help']}")
+
+
+RULES = (
+    "A word KEY=VALUE is a setting if KEY is one of those above (the part after the last dot is enough where only one, "
+    "or one with fewer dots than the others, has it), else a path if such a file exists; every other word is a path, "
+    "and so is every word after --. In lists of text commas separate and \\, is a comma."
+)
+
+
+def _shown(value: Any) -> str:
+    if value == "":
+        return "empty"
+    if isinstance(value, tuple):
+        return ",".join(map(str, value)) or "none"
+    return str(value).lower() if isinstance(value, bool) or value is None else str(value)
+
+
+def _entry(head: str, text: str, width: int) -> list[str]:
+    body = textwrap.wrap(text, width - 6) or [""]
+    return [f"  {head}", *(f"      {line}" for line in body)]
+
+
+def _option(option: Option, width: int) -> list[str]:
+    kind = option.metavar or describe(option.annotation)
+    return _entry(f"{option.key}={kind}", f"{option.help} [{_shown(option.default)}]", width)
+
+
+def command_help(
+    name: str, summary: str, cls: type[CommonConfig], flags: Mapping[str, str], conf: Path | None = None
+) -> str:
+    """The help of one command: usage, paths, settings with type, meaning and default, choices, flags."""
+    width = min(shutil.get_terminal_size((100, 24)).columns, 110)
+    # The options of the command first, then those of its sections.
+    options = sorted(options_of(cls), key=lambda option: "." in option.key)
+    choices = choices_of(cls, conf)
+    paths = next((option for option in options if option.key == "paths"), None)
+    word = f" {paths.metavar or 'PATH'}…" if paths else ""
+    lines = [f"usage: gsencoder {name}{word} [key=value …]", "", *textwrap.wrap(summary, width)]
+    if paths:
+        lines += ["", "paths:", *_entry(paths.metavar or "PATH", paths.help, width)]
+    groups = {group: members for group, members in choices.groups.items() if group != PRESET}
+    if groups:
+        lines += ["", "choices:"]
+        for group, members in groups.items():
+            text = next((str(each.metadata.get("help", "")) for each in fields(cls) if each.name == group), "")
+            meaning = f"{text} [{_shown(choices.chosen[group])}]".strip()
+            lines += _entry(f"{group}={'|'.join(members)}", meaning, width)
+    lines += ["", f"presets [{DEFAULT_PRESET}]:"]
+    for preset in PRESETS:
+        changes = ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, preset).items())
+        nothing = "the defaults" if preset == DEFAULT_PRESET else "changes nothing in this command"
+        lines += _entry(f"{PRESET}={preset}", changes or nothing, width)
+    lines += ["", "settings [default]:"]
+    for each in options:
+        if each.key != "paths" and not each.member and each.key not in choices.groups:
+            lines += _option(each, width)
+    for member in dict.fromkeys(each.member for each in options if each.member):
+        lines += ["", f"settings with {member} [default]:"]
+        for each in options:
+            if each.member == member:
+                lines += _option(each, width)
+    lines += ["", "flags:", *(f"  {flag:<12}{text}" for flag, text in flags.items())]
+    return "\n".join([*lines, "", *textwrap.wrap(RULES, width)])

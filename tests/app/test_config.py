@@ -11,17 +11,14 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from gsencoder.app import main as cli
-from gsencoder.app.compose import compose
+from gsencoder.app.compose import compose, join_list, split_list, typed
 from gsencoder.app.main import COMMANDS
 from gsencoder.app.options import (
     HIDDEN,
     CommonConfig,
     check_required,
-    join_list,
     options_of,
     settings,
-    split_list,
-    typed,
     union_members,
 )
 from gsencoder.core.errors import InputError
@@ -172,8 +169,8 @@ def test_a_command_without_paths_refuses_them(conf: Path) -> None:
 
 def test_required_settings_are_asked_for_by_name(conf: Path) -> None:
     with pytest.raises(InputError, match="SCENE is missing: scenes"):
-        check_required(ToyConfig, toy(conf))
-    check_required(ToyConfig, toy(conf, "scene"))
+        check_required(toy(conf))
+    check_required(toy(conf, "scene"))
 
 
 def test_settings_read_back_are_the_same_settings(conf: Path) -> None:

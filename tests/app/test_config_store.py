@@ -10,9 +10,19 @@ import pytest
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.compose import EXPERIMENT, choices_of, compose, conf_folder, open_hydra, plain_settings, run_many
+from gsencoder.app.compose import compose, open_hydra, plain_settings, run_many
 from gsencoder.app.main import COMMANDS
-from gsencoder.app.options import CommonConfig, field_types, member_name, options_of, section_classes, settings
+from gsencoder.app.options import (
+    EXPERIMENT,
+    CommonConfig,
+    choices_of,
+    conf_folder,
+    field_types,
+    member_name,
+    options_of,
+    section_classes,
+    settings,
+)
 from gsencoder.core.errors import InputError
 
 MISSING = object()

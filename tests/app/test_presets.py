@@ -7,9 +7,9 @@ import pytest
 from gsencoder.app.commands.encode import EncodeCommandConfig
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.compose import compose
+from gsencoder.app.compose import compose, typed
 from gsencoder.app.main import COMMANDS
-from gsencoder.app.options import PRESETS, options_by_key, preset_values, settings, typed
+from gsencoder.app.options import PRESETS, options_by_key, preset_values, settings
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import value_at
 from gsencoder.fusion.budget import exact_config

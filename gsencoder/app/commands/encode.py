@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.options import SharedScenesConfig, settings, typed
+from gsencoder.app.compose import typed
+from gsencoder.app.options import SharedScenesConfig, settings
 from gsencoder.app.run import Run
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.budget import MEGABYTE
