@@ -24,8 +24,7 @@ ROUNDS, PASSES = 3, 5
 
 def measure(model: str, splat: str) -> dict[str, float]:
     """One process's figures; runs in the child."""
-    from gsencoder.app.output import peak_memory_mb
-    from gsencoder.core.process import retain_freed_memory
+    from gsencoder.core.process import peak_memory_mb, retain_freed_memory
     from gsencoder.data.splats.files import load_splat
     from gsencoder.infer.encode import EncodeConfig, load_encoder
 

@@ -57,7 +57,7 @@ def main() -> None:
             usual, _ = CoverageObjective(cameras, [target], scores, config.count).greedy(config.count)
             fewest = [fewest_views(scores, ViewsBudget(error=error))[0] for error in errors]
             choices = [usual, *(choice.setting for choice in fewest)]
-            near = candidates.blend.near
+            near = free.blend.near
             usual_error, *realised = measured_errors(gaussians, [target], cameras, choices, near=near)
             for error, choice, measured in zip(errors, fewest, realised, strict=True):
                 lines.append(

@@ -26,7 +26,7 @@ from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 from tuning_pairs import png
 
 from gsencoder.app.options import SharedScenesConfig
-from gsencoder.app.output import Summary, output_file, output_folder
+from gsencoder.app.output import output_file, output_folder
 from gsencoder.app.run import Run, _is_finished
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
@@ -214,7 +214,7 @@ def fusion(folder: Path) -> Made:
 
 def finished(folder: Path) -> Made:
     run = Run("fuse", SharedScenesConfig())
-    with output_folder(folder / "out", summary=run) as out:
+    with output_folder(folder / "out", record=run.to_dict) as out:
         (out / "a.txt").write_text("x")
     return folder / "out" / "summary.json", lambda: _is_finished(folder / "out", run)
 
@@ -223,7 +223,7 @@ def written(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]
     """A file in the results of a run, in a folder of them."""
 
     def make(folder: Path) -> Made:
-        with output_folder(folder / "out", summary=Summary("test", {})) as out:
+        with output_folder(folder / "out", record=dict) as out:
             (out / "deep").mkdir()
             write(out / "deep")
         return folder / "out" / "deep" / name, lambda: read(folder / "out" / "deep" / name)
@@ -232,7 +232,7 @@ def written(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]
 
 
 def beside(folder: Path) -> Made:
-    with output_file(folder / "new.ply", overwrite=False, summary=Summary("repair", {})):
+    with output_file(folder / "new.ply", overwrite=False, record=dict):
         save_splat(folder / "new.ply", random_gaussians(20))
     return folder / "new.ply", lambda: _arrays(load_splat(folder / "new.ply"))
 

@@ -25,7 +25,7 @@ def write_toy(config: Any, summary: Any) -> None:
     if config.size < 0:
         raise InputError("size: expected a positive number")
     if config.out is not None:
-        with output_folder(config.out, overwrite=config.overwrite, summary=summary) as folder:
+        with output_folder(config.out, overwrite=config.overwrite, record=summary.to_dict) as folder:
             (folder / "word").write_text(config.word)
 
 

@@ -14,16 +14,15 @@ import sys
 import textwrap
 import time
 import traceback
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
 
 import gsencoder
-from gsencoder.app.options import CommonConfig, check_required, command_help, near, settings, without_value
-from gsencoder.core.errors import InputError, SceneWarning, clipped, one_line, printable
+from gsencoder.app.options import CommonConfig, command_help, near, settings, without_value
+from gsencoder.core.errors import InputError, clipped, one_line, printable
 from gsencoder.core.process import Stopped, refuse_several, stop_of, stopping_signals
 
 
@@ -261,15 +260,24 @@ def _run(command: Command, config: Any, debug: bool, began: float | None = None)
     from gsencoder.app.output import refuse_to_replace_inputs
     from gsencoder.app.run import Run
 
-    if not command.several:
-        together = ", ".join(each.name for each in COMMANDS.values() if each.several)
-        refuse_several(command.name, f"start it once; {together} are the commands that processes run together")
     _, run_command = command.load()
     check_required(config)
-    run = Run(command.name, config, began)
-    refuse_to_replace_inputs(config.out, run.settings)
-    with _collected_warnings(run.add_warning, debug), _impossible_sizes():
-        run_command(config, run)
+    with _impossible_sizes():
+        if not command.several:
+            together = ", ".join(each.name for each in COMMANDS.values() if each.several)
+            refuse_several(command.name, f"start it once; {together} are the commands that processes run together")
+        run = Run(command.name, config, began)
+        with run.warning_lines(debug):
+            refuse_to_replace_inputs(config.out, run.settings)
+            run_command(config, run)
+
+
+def check_required(config: Any) -> None:
+    """Raises an InputError about the first required option that is empty."""
+    for item in fields(config):
+        if item.metadata.get("required") and getattr(config, item.name) in (None, "", ()):
+            name = item.metadata.get("metavar", "PATH") if item.name == "paths" else f"{item.name}="
+            raise InputError(f"{name} is missing: {item.metadata['help']}")
 
 
 def _run_one(command: Command, config: Any, debug: bool) -> str:
@@ -282,24 +290,6 @@ def _run_one(command: Command, config: Any, debug: bool) -> str:
         # Whoever started the run in another process has not seen them.
         return "\n".join((message, *getattr(error, "reasons", ())))
     return ""
-
-
-@contextmanager
-def _collected_warnings(add: Callable[[str], str], debug: bool) -> Iterator[None]:
-    """Each `SceneWarning` is added to a summary, and what that returns becomes one line on standard error."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", SceneWarning)
-        usual = warnings.showwarning
-
-        def show(message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None) -> None:
-            if not issubclass(category, SceneWarning):
-                usual(message, category, filename, lineno, file, line)
-                return
-            text = one_line(add(one_line(str(message))))
-            print(f"warning: {text}" + (f" ({filename}:{lineno})" if debug else ""), file=sys.stderr)
-
-        warnings.showwarning = show
-        yield
 
 
 def _overview() -> str:

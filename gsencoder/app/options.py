@@ -27,7 +27,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
-from gsencoder.core.errors import InputError
 from gsencoder.core.settings import CheckedConfig, option, shown_value
 
 Kind = Literal["text", "list", "value"]
@@ -406,14 +405,6 @@ def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
     for each in options_of(cls):
         members[each.key] = (*members.get(each.key, ()), each.member) if each.member else ()
     return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=defaults)
-
-
-def check_required(config: Any) -> None:
-    """Raises an InputError about the first required option that is empty."""
-    for item in fields(config):
-        if item.metadata.get("required") and getattr(config, item.name) in (None, "", ()):
-            name = item.metadata.get("metavar", "PATH") if item.name == "paths" else f"{item.name}="
-            raise InputError(f"{name} is missing: {item.metadata['help']}")
 
 
 RULES = (

@@ -1,23 +1,17 @@
-"""Where a run writes: its record in summary.json, the output file or folder, and the folder of its unfinished work."""
+"""Where a run writes: the file or folder of results, with its record, and the folder of unfinished work."""
 
 import ctypes
 import errno
 import os
-import platform
 import re
-import resource
 import secrets
 import shutil
-import sys
-import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import gsencoder
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files import (
     SUMMARY_NAME,
@@ -29,101 +23,14 @@ from gsencoder.core.files import (
     json_bytes,
     lock_folder,
     locked,
-    plain,
     sha256_of,
     short_name,
     write_bytes,
     write_json,
 )
-from gsencoder.core.process import status_kib
-from gsencoder.core.threads import available_cores
 
-LIBRARIES = (
-    *("numpy", "torch", "numba", "scipy", "open3d", "trimesh", "pycolmap", "onnxruntime"),
-    *("gsply", "safetensors", "transformers", "gsplat", "triton", "sklearn"),
-)
-"""Libraries whose versions are recorded, if the run imported them."""
-
-
-def peak_memory_mb() -> float:
-    """Peak resident memory of this process, MiB."""
-    # On Linux ru_maxrss starts from the size of the parent at the fork; VmHWM is that of the process alone.
-    with suppress(OSError):
-        return status_kib("VmHWM") / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 2**20
-
-
-class Summary:
-    """Collects the settings of a run, the seconds of each step, warnings and results (figures and file names)."""
-
-    def __init__(self, command: str, settings: Mapping[str, Any], began: float | None = None) -> None:
-        self.command = command
-        self.settings = dict(settings)
-        self.results: dict[str, Any] = {}
-        self.warnings: list[str] = []
-        self.timings: dict[str, float] = {}
-        self.began = time.perf_counter() if began is None else began
-        self._scene: tuple[str, Path, Summary] | None = None
-
-    def add_warning(self, text: str) -> str:
-        """Adds a warning; the command line adds every `SceneWarning` of the run. Returns it as the run shows it: with
-        the name of the scene, if there are several and it names none."""
-        if self._scene is not None:
-            name, path, of_scene = self._scene
-            of_scene.warnings.append(text)
-            if not text.startswith(f"{name}: ") and str(path) not in text:
-                text = f"{name}: {text}"
-        self.warnings.append(text)
-        return text
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        """Adds the seconds of the block to the step, also if it fails."""
-        start = time.perf_counter()
-        self.timings.setdefault(name, 0.0)
-        try:
-            yield
-        finally:
-            self.timings[name] += time.perf_counter() - start
-
-    def add_seconds(self, steps: Mapping[str, float]) -> None:
-        """Adds the seconds of steps that were timed elsewhere."""
-        for name, seconds in steps.items():
-            self.timings[name] = self.timings.get(name, 0.0) + seconds
-
-    def costs(self) -> dict[str, float]:
-        """What pages say of the run."""
-        return {"seconds": sum(self.timings.values()), "peak memory, MiB": peak_memory_mb()}
-
-    def to_dict(self) -> dict[str, Any]:
-        """The record as JSON values. `non_finite` lists the results that were not finite and are null."""
-        lost: list[str] = []
-        results = plain(self.results, "results", lost)
-        total = time.perf_counter() - self.began
-        record = {
-            "command": self.command,
-            "version": gsencoder.__version__,
-            "settings": plain(self.settings, "settings", lost),
-            "timings": {name: round(seconds, 4) for name, seconds in (*self.timings.items(), ("total", total))},
-            "peak_memory_mb": plain(round(peak_memory_mb(), 1)),
-            "warnings": list(self.warnings),
-            "results": results,
-            "versions": _versions(),
-            "platform": {
-                "system": platform.system(),
-                "machine": platform.machine(),
-                "processors": available_cores(),
-            },
-        }
-        return record | ({"non_finite": lost} if lost else {})
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for module in (name for name in LIBRARIES if name in sys.modules):
-        with suppress(PackageNotFoundError):
-            versions[module] = version("scikit-learn" if module == "sklearn" else module)
-    return versions
+Record = Callable[[], dict[str, Any]]
+"""Makes the record of a run, for summary.json."""
 
 
 def check_output_files(paths: Iterable[Path], overwrite: bool) -> None:
@@ -141,23 +48,23 @@ def _refuse_existing(path: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def output_file(path: Path, *, overwrite: bool, summary: Summary) -> Iterator[None]:
-    """Lets one run at a time write a file, and writes the summary beside it, as FILE.summary.json with its checksum:
-    two runs of one out= would otherwise leave the file of one beside the summary of the other."""
+def output_file(path: Path, *, overwrite: bool, record: Record) -> Iterator[None]:
+    """Lets one run at a time write a file, and writes its record as FILE.summary.json, with the file's checksum: two
+    runs of one out= would otherwise leave the file of one with the record of the other."""
     with ExitStack() as stack:
         # Where the folder is missing or refuses, whoever writes the file says so.
         with suppress(OSError):
             stack.enter_context(locked(path.resolve().parent, wait=True))
         _refuse_existing(path, overwrite)
         yield
-        write_json(f"{path}.{SUMMARY_NAME}", summary.to_dict() | {"files": {path.name: sha256_of(path)}})
+        write_json(f"{path}.{SUMMARY_NAME}", record() | {"files": {path.name: sha256_of(path)}})
 
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 
 
 @contextmanager
-def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary | None = None) -> Iterator[Path]:
+def output_folder(path: str | Path, *, overwrite: bool = False, record: Record | None = None) -> Iterator[Path]:
     """Opens a folder to write into, which is renamed to `path` when the block ends without an error.
 
     Until then it is a hidden folder beside it, `.NAME.partial-XXXXXXXX`. It is removed if the block ends early, also by
@@ -168,7 +75,8 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         path: the folder; its parents are created. It may exist if it is empty.
         overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
             old and new are exchanged in one step.
-        summary: written into the folder at the end, as summary.json, with the checksums of files that have none.
+        record: what it returns at the end is written into the folder, as summary.json, with the checksums of files that
+            have none.
     """
     # Of a symbolic link the target is replaced, not the link.
     target = Path(os.path.realpath(path))
@@ -184,9 +92,9 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
     try:
         yield partial
-        if summary is not None:
-            record = summary.to_dict() | {"files": checksums_of(partial)}
-            write_bytes(partial / SUMMARY_NAME, json_bytes(record)[0])
+        if record is not None:
+            written = record() | {"files": checksums_of(partial)}
+            write_bytes(partial / SUMMARY_NAME, json_bytes(written)[0])
         _sync(partial)
         _check_target(path, target, overwrite)
         _move_into_place(partial, target)
@@ -202,21 +110,24 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
             os.close(lock)
 
 
+def _hidden(target: Path, suffix: str) -> Path:
+    return target.parent / f".{short_name(target.name)}.{suffix}"
+
+
 def _begin(path: str | Path, target: Path, overwrite: bool) -> tuple[Path, int | None]:
     """Creates and locks the hidden folder. Runs that start at the same moment do so one after the other: a folder that
     is created and not yet locked would be mistaken for that of a killed run."""
+    backup, partial = _hidden(target, "earlier"), _hidden(target, f"partial-{secrets.token_hex(4)}")
     parent_lock = lock_folder(target.parent, wait=True)
     try:
         if _remove_stale(target):
             raise BlockingIOError
-        aside = _aside(target)
-        if aside.is_dir() and not os.path.lexists(target):
+        if backup.is_dir() and not os.path.lexists(target):
             # A run that was replacing these results was killed between two names.
-            os.rename(aside, target)
-        shutil.rmtree(aside, ignore_errors=True)
+            os.rename(backup, target)
+        shutil.rmtree(backup, ignore_errors=True)
         # Another run may have written the folder since it was looked at.
         _check_target(path, target, overwrite)
-        partial = target.parent / f".{short_name(target.name)}.partial-{secrets.token_hex(4)}"
         partial.mkdir()
         return partial, lock_folder(partial)
     finally:
@@ -278,7 +189,7 @@ def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
 def _remove_stale(target: Path) -> bool:
     """Removes the hidden folders of killed runs beside `target`; returns whether another run is writing it now. Where
     folders cannot be locked (some network file systems) nothing is removed and no run is detected."""
-    pattern = re.compile(re.escape(f".{short_name(target.name)}.partial-") + "[0-9a-f]{8}")
+    pattern = re.compile(re.escape(_hidden(target, "partial-").name) + "[0-9a-f]{8}")
     for entry in list(os.scandir(target.parent)):
         if not pattern.fullmatch(entry.name) or not entry.is_dir(follow_symlinks=False):
             continue
@@ -319,18 +230,14 @@ def _move_into_place(partial: Path, target: Path) -> None:
     """Renames `partial` to `target`; an existing `target` is renamed to `partial`."""
     old = target.is_dir() and any(target.iterdir())
     if old and not _exchange(partial, target):
-        aside = _aside(target)
-        os.rename(target, aside)
+        # The earlier results have another name for a moment.
+        backup = _hidden(target, "earlier")
+        os.rename(target, backup)
         os.rename(partial, target)
-        os.rename(aside, partial)
+        os.rename(backup, partial)
     elif not old:
         os.rename(partial, target)
     _sync_one(target.parent)
-
-
-def _aside(target: Path) -> Path:
-    """Where earlier results lie for a moment while new ones take their name, if names cannot be exchanged."""
-    return target.parent / f".{short_name(target.name)}.earlier"
 
 
 def _exchange(first: Path, second: Path) -> bool:

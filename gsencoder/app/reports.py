@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsencoder.app.output import Summary
+from gsencoder.app.run import Run
 from gsencoder.core.arrays import even_indices
 from gsencoder.infer.draw import depth_picture, fit_pca_colors, pca_picture
 from gsencoder.infer.page.report import HtmlReport
@@ -65,15 +65,15 @@ def add_features(report: HtmlReport, features: Mapping[str, GaussianFeatures], t
 
 
 def report_fusion(
-    folder: Path, scene: Scene, features: GaussianFeatures, truncation: float, teacher: str, summary: Summary
+    folder: Path, scene: Scene, features: GaussianFeatures, truncation: float, teacher: str, run: Run
 ) -> None:
     """Writes the page of a fusion; `truncation` is what the basis costs, as a centered cosine error."""
     report = HtmlReport(f"Features of {scene.name}", f"Maps of the teacher {teacher}, lifted from all views.")
     assert scene.views is not None
     counts = {"Gaussians": len(features), "with features": int(features.seen.sum()), "views": len(scene.views)}
-    report.facts({**counts, **summary.costs()})
+    report.facts({**counts, **run.costs()})
     add_views(report, scene, {teacher: features})
     add_features(report, {teacher: features}, {teacher: truncation})
     report.section("Seconds of each step")
-    report.timings(summary.timings)
+    report.timings(run.timings)
     report.write(folder / REPORT)

@@ -3,12 +3,14 @@ queue of several scenes."""
 
 import json
 import math
+import platform
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,9 +19,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bars
 from rich.segment import Segment
 
+import gsencoder
 from gsencoder.app.options import CommonConfig, settings
 from gsencoder.app.output import (
-    Summary,
     WorkFolder,
     check_output_files,
     output_file,
@@ -30,8 +32,9 @@ from gsencoder.app.output import (
 from gsencoder.core.budget import Budget
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, listed, one_line, printable
 from gsencoder.core.files import SUMMARY_NAME, plain, read_foreign_text
-from gsencoder.core.process import Device, ProcessRank, refuse_several
+from gsencoder.core.process import Device, ProcessRank, peak_memory_mb, refuse_several
 from gsencoder.core.settings import describe_values, shown_value
+from gsencoder.core.threads import available_cores
 from gsencoder.data.scenes import check_names, scene_name
 from gsencoder.data.up import Up
 
@@ -91,8 +94,7 @@ class Progress:
 
     def _in_lines(self, items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
         start = last = time.monotonic()
-        of, label = f"/{total}" if total is not None else "", printable(label)
-        count = 0
+        of, count = f"/{total}" if total is not None else "", 0
         for item in items:
             yield item
             count += 1
@@ -104,12 +106,96 @@ class Progress:
             print(f"{label}: {count} done in {time.monotonic() - start:.0f} s", file=self._stream, flush=True)
 
 
-class Run(Summary):
-    """A run of a command: its settings and its record, what it prints, and where it writes."""
+LIBRARIES = (
+    *("numpy", "torch", "numba", "scipy", "open3d", "trimesh", "pycolmap", "onnxruntime"),
+    *("gsply", "safetensors", "transformers", "gsplat", "triton", "sklearn"),
+)
+"""Libraries whose versions are recorded, if the run imported them."""
+
+
+class Run:
+    """A run of a command: what it prints, where it writes, and its record: settings, seconds of each step, warnings and
+    results (figures and file names)."""
 
     def __init__(self, command: str, config: CommonConfig, began: float | None = None) -> None:
-        super().__init__(command, settings(config), began)
-        self.config, self.screen, self.track = config, console(config.quiet), Progress(quiet=config.quiet)
+        self.command, self.config, self.settings = command, config, settings(config)
+        self.screen, self.track = console(config.quiet), Progress(quiet=config.quiet)
+        self.results: dict[str, Any] = {}
+        self.warnings: list[str] = []
+        self.timings: dict[str, float] = {}
+        self.began = time.perf_counter() if began is None else began
+        self._scene: tuple[str, Path, Run] | None = None
+
+    def add_warning(self, text: str) -> str:
+        """Adds a warning; the command line adds every `SceneWarning` of the run. Returns it as the run shows it: with
+        the name of the scene, if there are several and it names none."""
+        if self._scene is not None:
+            name, path, of_scene = self._scene
+            of_scene.warnings.append(text)
+            if not text.startswith(f"{name}: ") and str(path) not in text:
+                text = f"{name}: {text}"
+        self.warnings.append(text)
+        return text
+
+    @contextmanager
+    def warning_lines(self, debug: bool) -> Iterator[None]:
+        """Records each `SceneWarning` of the block, and prints it as one line on standard error."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", SceneWarning)
+            usual = warnings.showwarning
+
+            def show(
+                message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None
+            ) -> None:
+                if not issubclass(category, SceneWarning):
+                    usual(message, category, filename, lineno, file, line)
+                    return
+                text = one_line(self.add_warning(one_line(str(message))))
+                print(f"warning: {text}" + (f" ({filename}:{lineno})" if debug else ""), file=sys.stderr)
+
+            warnings.showwarning = show
+            yield
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Adds the seconds of the block to the step, also if it fails."""
+        start = time.perf_counter()
+        self.timings.setdefault(name, 0.0)
+        try:
+            yield
+        finally:
+            self.timings[name] += time.perf_counter() - start
+
+    def add_seconds(self, steps: Mapping[str, float]) -> None:
+        """Adds the seconds of steps that were timed elsewhere."""
+        for name, seconds in steps.items():
+            self.timings[name] = self.timings.get(name, 0.0) + seconds
+
+    def costs(self) -> dict[str, float]:
+        """What pages say of the run."""
+        return {"seconds": sum(self.timings.values()), "peak memory, MiB": peak_memory_mb()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The record as JSON values. `non_finite` lists the results that were not finite and are null."""
+        lost: list[str] = []
+        results = plain(self.results, "results", lost)
+        total, versions = time.perf_counter() - self.began, _versions()
+        record = {
+            "command": self.command,
+            "version": gsencoder.__version__,
+            "settings": plain(self.settings, "settings", lost),
+            "timings": {name: round(seconds, 4) for name, seconds in (*self.timings.items(), ("total", total))},
+            "peak_memory_mb": plain(round(peak_memory_mb(), 1)),
+            "warnings": list(self.warnings),
+            "results": results,
+            "versions": versions,
+            "platform": {
+                "system": platform.system(),
+                "machine": platform.machine(),
+                "processors": available_cores(),
+            },
+        }
+        return record | ({"non_finite": lost} if lost else {})
 
     def print(self, *lines: RenderableType, **options: Any) -> None:
         """Prints results, each on a line of its own, unless quiet=true."""
@@ -163,7 +249,7 @@ class Run(Summary):
     @contextmanager
     def folder(self, out: Path) -> Iterator[Path]:
         """Opens the output folder of the results and of this record; see `output_folder`."""
-        with output_folder(out, overwrite=self.config.overwrite, summary=self) as folder:
+        with output_folder(out, overwrite=self.config.overwrite, record=self.to_dict) as folder:
             yield folder
 
     @contextmanager
@@ -181,7 +267,7 @@ class Run(Summary):
     @contextmanager
     def file(self, out: Path) -> Iterator[None]:
         """Lets the block write the one file of the results, and writes this record beside it; see `output_file`."""
-        with output_file(out, overwrite=self.config.overwrite, summary=self):
+        with output_file(out, overwrite=self.config.overwrite, record=self.to_dict):
             yield
 
     @contextmanager
@@ -249,6 +335,14 @@ class Run(Summary):
             if not process.is_first:
                 self.screen, self.track = console(quiet=True), Progress(quiet=True)
             yield Group(self, out, work, process, used, results)
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for module in (name for name in LIBRARIES if name in sys.modules):
+        with suppress(PackageNotFoundError):
+            versions[module] = version("scikit-learn" if module == "sklearn" else module)
+    return versions
 
 
 @dataclass(frozen=True, slots=True)

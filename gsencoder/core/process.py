@@ -9,6 +9,7 @@ import gc
 import math
 import os
 import re
+import resource
 import signal
 import sys
 import threading
@@ -299,6 +300,14 @@ def memory_growth() -> Iterator[Growth]:
         return
     yield growth
     growth.mib = max(status_kib("VmHWM") - before, 0) / 1024
+
+
+def peak_memory_mb() -> float:
+    """Peak resident memory of this process, MiB."""
+    # On Linux ru_maxrss starts from the size of the parent at the fork; VmHWM is that of the process alone.
+    with suppress(OSError):
+        return status_kib("VmHWM") / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 2**20
 
 
 def status_kib(name: str) -> int:

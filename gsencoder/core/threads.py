@@ -17,9 +17,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Any, TypeVar
 
-import numpy as np
-from jaxtyping import Int64
-
 from gsencoder.core.errors import SceneWarning
 
 Result = TypeVar("Result")
@@ -207,9 +204,3 @@ def import_ahead(module: str) -> None:
             importlib.import_module(module)
 
     threading.Thread(target=load).start()
-
-
-def even_cuts(starts: Int64[np.ndarray, " n_plus_1"]) -> Int64[np.ndarray, " pieces_plus_1"]:
-    """Cuts the rows of a compressed array into pieces with about equally many entries."""
-    inner = np.searchsorted(starts, np.linspace(0, starts[-1], PIECES + 1)[1:-1])
-    return np.concatenate(([0], inner, [len(starts) - 1]))

@@ -235,6 +235,7 @@ def blend(
         lattice = patch_lattice(width, height, patch, config.rays_per_patch)
     else:
         lattice = strided_lattice(width, height, stride)
+    knobs = {"stop": config.stop_transmittance, "keep": config.min_weight}
     backend = config.backend
     on_cpu = torch.device(device).type == "cpu"
     if backend == "auto":
@@ -242,8 +243,14 @@ def blend(
     if backend == "cpu":
         if not on_cpu:
             raise InputError(f"blend.backend: cpu computes on a CPU alone, got device {device}; use auto or torch")
-        pose, K = cameras.cam_from_world[view], cameras.Ks[view]
-        return _blend_cpu(gaussians, pose, K, (width, height), lattice, between, config)
+        if between is None:
+            between = np.full(lattice.rows, -np.inf, np.float32), np.full(lattice.rows, np.inf, np.float32)
+        pose, K, size = cameras.cam_from_world[view], cameras.Ks[view], (width, height)
+        made = blend_cpu.blend_weights(
+            gaussians, pose, K, size, lattice, between, eps2d=config.eps2d, near=config.near, **knobs
+        )
+        crow, col, weight, depths = map(torch.from_numpy, made)
+        return Blend(crow, col, weight, depths, lattice, config)
 
     def tensor(array: np.ndarray, dtype: torch.dtype = dtype) -> Tensor:
         return torch.as_tensor(array, device=device).to(dtype)
@@ -263,29 +270,8 @@ def blend(
         near=config.near,
     )
     make = blend_torch.reference_weights if backend == "reference" else blend_torch.blend_weights
-    knobs = {"stop": config.stop_transmittance, "keep": config.min_weight}
     crow, col, weight = make(projected, tensor(gaussians.opacities), lattice, **knobs)
     b = Blend(crow, col, weight, projected.depths.to(dtype), lattice, config)
     if between is None:
         return b
     return b.keep_between(*(torch.from_numpy(depths).to(b.depths) for depths in between))
-
-
-def _blend_cpu(
-    gaussians: Gaussians,
-    pose: np.ndarray,
-    K: np.ndarray,
-    size: tuple[int, int],
-    lattice: Lattice,
-    between: tuple[np.ndarray, np.ndarray] | None,
-    config: BlendConfig,
-) -> Blend:
-    projected, index, z = blend_cpu.project(gaussians, pose, K, *size, lattice, eps2d=config.eps2d, near=config.near)
-    depths = np.zeros(len(gaussians), np.float32)
-    depths[index] = z
-    if between is None:
-        between = np.full(lattice.rows, -np.inf, np.float32), np.full(lattice.rows, np.inf, np.float32)
-    keep, stop = config.min_weight, config.stop_transmittance
-    made = blend_cpu.blend_weights(lattice, projected, index, z, depths, between, stop=stop, keep=keep)
-    crow, col, weight = map(torch.from_numpy, made)
-    return Blend(crow, col, weight, torch.from_numpy(depths), lattice, config)

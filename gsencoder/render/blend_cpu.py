@@ -6,7 +6,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from gsencoder.core.threads import PIECES, even_cuts, kernel, parallel
+from gsencoder.core.threads import PIECES, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render.rays import Lattice
 from gsencoder.types import Gaussians
@@ -299,39 +299,49 @@ def _stable_order(depths: Float64[np.ndarray, " M"]) -> Int64[np.ndarray, " M"]:
     return order
 
 
+def even_cuts(starts: Int64[np.ndarray, " n_plus_1"]) -> Int64[np.ndarray, " pieces_plus_1"]:
+    """Cuts the rows of a compressed array into pieces with about equally many entries."""
+    inner = np.searchsorted(starts, np.linspace(0, starts[-1], PIECES + 1)[1:-1])
+    return np.concatenate(([0], inner, [len(starts) - 1]))
+
+
 def blend_weights(
+    gaussians: Gaussians,
+    pose: np.ndarray,
+    K: np.ndarray,
+    size: tuple[int, int],
     lattice: Lattice,
-    gaussians: Float64[np.ndarray, "N 9"],
-    index: Int32[np.ndarray, " M"],
-    z: Float64[np.ndarray, " M"],
-    depths: Float32[np.ndarray, " N"],
     between: tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]],
     *,
+    eps2d: float,
+    near: float,
     stop: float,
     keep: float,
-) -> tuple[Int64[np.ndarray, " P_plus_1"], Int32[np.ndarray, " nnz"], Float32[np.ndarray, " nnz"]]:
-    """CSR (crow, col, weight) of B.
+) -> tuple[
+    Int64[np.ndarray, " P_plus_1"], Int32[np.ndarray, " nnz"], Float32[np.ndarray, " nnz"], Float32[np.ndarray, " N"]
+]:
+    """CSR (crow, col, weight) of B, and the depths of all Gaussians, 0 for those that do not touch the image.
 
     Args:
-        gaussians: on the image plane, from `project`.
-        index: which of them touch the image.
-        z: their depths, which order them.
-        depths: of all Gaussians, which are held against `between`.
+        size: width and height of the image, pixels.
         between: smallest and largest depth of the entries that each row stores.
     """
+    projected, index, z = project(gaussians, pose, K, *size, lattice, eps2d=eps2d, near=near)
+    depths = np.zeros(len(gaussians), np.float32)
+    depths[index] = z
     tile = lattice.tile
     tiles_x, tiles_y = -(-lattice.width * lattice.side // tile), -(-lattice.height * lattice.side // tile)
     last_u, last_v = float(tiles_x * tile - 1), float(tiles_y * tile - 1)
-    starts, members, _, _ = bin_tiles(gaussians, index, _stable_order(z), tile, tiles_x, tiles_y, 0.0, last_u, last_v)
+    starts, members, _, _ = bin_tiles(projected, index, _stable_order(z), tile, tiles_x, tiles_y, 0.0, last_u, last_v)
     shape = (lattice.height, lattice.width, lattice.side, tile, tiles_x)
     cuts = even_cuts(starts)
     room = np.concatenate(([0], np.cumsum(_ENTRIES * (tile // lattice.side) ** 2 * np.diff(cuts))))
     scratch = _take_scratch(int(room[-1]))
-    crow = np.zeros(lattice.rows + 1, np.int64)
+    crow = np.zeros(len(between[0]) + 1, np.int64)
 
     def work(piece: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         space = (part[room[piece] : room[piece + 1]] for part in scratch)
-        ranges, tiles = (cuts[piece], cuts[piece + 1]), (starts, members, gaussians)
+        ranges, tiles = (cuts[piece], cuts[piece + 1]), (starts, members, projected)
         return _blend_tiles(*ranges, *tiles, depths, *between, shape, stop, keep, crow[1:], *space)
 
     # A row belongs to one tile, a tile to one piece: the pieces write to disjoint places.
@@ -342,7 +352,7 @@ def blend_weights(
     parallel(lambda piece: _scatter(*pieces[piece], where, cols, weights), range(PIECES))
     if len(scratch[0]) <= _SCRATCH_KEPT:
         _free_scratch.append(scratch)
-    return crow, cols, weights
+    return crow, cols, weights, depths
 
 
 @kernel

@@ -24,11 +24,11 @@ from torch import Tensor
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import CheckedConfig, option
-from gsencoder.core.threads import PIECES, even_cuts, kernel, parallel
+from gsencoder.core.threads import PIECES, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render import blend_torch
-from gsencoder.render.blend_cpu import bin_tiles
-from gsencoder.render.rays import pixel_lattice
+from gsencoder.render.blend_cpu import bin_tiles, even_cuts
+from gsencoder.render.rays import strided_lattice
 
 RasterBackend = Literal["auto", "cpu", "reference", "gsplat"]
 
@@ -95,7 +95,7 @@ def rasterize(
         out = _Composite.apply(*shapes, extents, limit, projected.depths.detach()[rows], width, height, stop)
     else:
         values = torch.cat((values, torch.ones_like(values[:, :1])), dim=1)
-        flat = blend_torch.composite(projected, opacities, values, pixel_lattice(width, height), stop=stop)
+        flat = blend_torch.composite(projected, opacities, values, strided_lattice(width, height, 1), stop=stop)
         out = flat.unflatten(0, (height, width))
     radii = torch.where(projected.valid, projected.extents.detach().amax(dim=1), 0)
     return Raster(out[..., :3], out[..., 4], out[..., 3], projected.means2d, radii)

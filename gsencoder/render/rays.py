@@ -22,6 +22,7 @@ class Lattice:
         side: rays along one side of a cell.
         x0, y0: first ray, in pixels.
         dx, dy: distance between rays, in pixels.
+        tile: rays along one side of a binning tile: a whole number of cells, near 16.
     """
 
     height: int
@@ -31,20 +32,11 @@ class Lattice:
     y0: float
     dx: float
     dy: float
+    tile: int = 16
 
     @property
     def rows(self) -> int:
         return self.height * self.width
-
-    @property
-    def tile(self) -> int:
-        """Rays along one side of a binning tile: a whole number of cells, near 16."""
-        return self.side * max(1, round(16 / self.side))
-
-
-def pixel_lattice(width: int, height: int) -> Lattice:
-    """One ray through each pixel center."""
-    return Lattice(height=height, width=width, side=1, x0=0.5, y0=0.5, dx=1.0, dy=1.0)
 
 
 def strided_lattice(width: int, height: int, stride: int) -> Lattice:
@@ -84,4 +76,5 @@ def grid_lattice(grid_from_image: Float64[np.ndarray, "2 3"], width: int, height
         raise InputError(f"rays_per_patch: expected a square number (1, 4, 9, 16, …), got {rays_per_patch}")
     (ax, _, bx), (_, ay, by) = grid_from_image.tolist()
     dx, dy = 1 / (ax * side), 1 / (ay * side)
-    return Lattice(height=height, width=width, side=side, x0=-bx / ax + dx / 2, y0=-by / ay + dy / 2, dx=dx, dy=dy)
+    x0, y0, tile = -bx / ax + dx / 2, -by / ay + dy / 2, side * max(1, round(16 / side))
+    return Lattice(height=height, width=width, side=side, x0=x0, y0=y0, dx=dx, dy=dy, tile=tile)

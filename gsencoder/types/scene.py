@@ -237,6 +237,12 @@ class Cameras:
         return Cameras(cam_from_world=self.cam_from_world, Ks=Ks, widths=widths, heights=heights)
 
 
+def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:
+    """The cameras of one or more lists, one list after the other."""
+    fields = Cameras.__dataclass_fields__
+    return Cameras(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})
+
+
 LAZY = ("images", "depths", "masks", "empty", "instances")  # Fields of Views that are sequences with one entry a camera
 
 

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 
 from gsencoder.app import main as cli
 from gsencoder.app.compose import compose, join_list, split_list, typed
-from gsencoder.app.main import COMMANDS
+from gsencoder.app.main import COMMANDS, check_required
 from gsencoder.app.options import (
     HIDDEN,
     CommonConfig,
-    check_required,
     options_of,
     settings,
     union_members,

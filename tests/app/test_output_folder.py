@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from gsencoder.app import output as outputs
-from gsencoder.app.output import Summary, check_output_files, output_folder, refuse_to_replace_inputs
+from gsencoder.app.output import check_output_files, output_folder, refuse_to_replace_inputs
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import SUMMARY_NAME, write_bytes
 
@@ -30,7 +30,7 @@ def write_and_raise(path: Path, error: BaseException, **options: Any) -> None:
 
 
 def fill(path: Path, text: str, **options: Any) -> None:
-    with output_folder(path, summary=Summary("fuse", {"voxel": 0.02}), **options) as folder:
+    with output_folder(path, record=lambda: {"command": "fuse"}, **options) as folder:
         (folder / "deep").mkdir()
         (folder / "deep" / "data.txt").write_text(text)
 

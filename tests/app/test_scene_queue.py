@@ -12,7 +12,7 @@ from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import main as cli
 from gsencoder.app.options import SharedScenesConfig
-from gsencoder.app.output import Summary, output_folder
+from gsencoder.app.output import output_folder
 from gsencoder.app.run import Run
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.data.scenes import find_scenes, listed_paths
@@ -32,10 +32,10 @@ class Work:
     def __init__(self, *failing: str, busy: str = "") -> None:
         self.failing, self.busy, self.done = failing, busy, list[str]()
 
-    def __call__(self, path: Path, out: Path, summary: Summary) -> None:
+    def __call__(self, path: Path, out: Path, summary: Run) -> None:
         if path.name == self.busy:
             raise BusyError(f"{out}: another run is writing this folder now")
-        with output_folder(out, summary=summary) as folder:
+        with output_folder(out, record=summary.to_dict) as folder:
             if path.name in self.failing:
                 raise InputError(f"{path}: no photographs")
             (folder / "name.txt").write_text(path.name)
@@ -66,10 +66,10 @@ def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(tm
 def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Path) -> None:
     summary = Run("fuse", QueueConfig(out=tmp_path / "out"))
     assert summary.add_warning("weights: old") == "weights: old"
-    shown, given = list[str](), list[Summary]()
+    shown, given = list[str](), list[Run]()
 
-    def run(path: Path, out: Path, one: Summary) -> None:
-        with output_folder(out, summary=one):
+    def run(path: Path, out: Path, one: Run) -> None:
+        with output_folder(out, record=one.to_dict):
             # As the command line does, which knows the summary of the whole run alone.
             shown.append(summary.add_warning(texts[path.name]))
         given.append(one)
@@ -126,8 +126,8 @@ def test_without_an_output_folder_results_lie_in_outputs(tmp_path, names, monkey
 
 def test_a_scene_that_another_process_finished_meanwhile_is_no_failure(tmp_path: Path) -> None:
     class Late(Work):
-        def __call__(self, path: Path, out: Path, summary: Summary) -> None:
-            with output_folder(out, summary=summary):
+        def __call__(self, path: Path, out: Path, summary: Run) -> None:
+            with output_folder(out, record=summary.to_dict):
                 pass
             super().__call__(path, out, summary)
 

@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsencoder.app.output import SUMMARY_NAME, Summary, output_folder, peak_memory_mb
+from gsencoder.app.options import SharedScenesConfig
+from gsencoder.app.run import Run
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.files import write_json
+from gsencoder.core.files import SUMMARY_NAME, write_json
+from gsencoder.core.process import peak_memory_mb
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ def test_numbers_that_are_not_finite_become_null_and_are_named(tmp_path: Path) -
 
 
 def test_a_summary_records_what_the_run_did(tmp_path: Path) -> None:
-    summary = Summary("fuse", {"out": Path("x"), "voxel": 0.02})
+    summary = Run("fuse", SharedScenesConfig(out=Path("x"), worker=2))
     for _ in range(2):
         with summary.step("fuse"):
             time.sleep(0.01)
@@ -60,10 +62,10 @@ def test_a_summary_records_what_the_run_did(tmp_path: Path) -> None:
     summary.add_seconds({"fuse": 0.5, "seeds": 1.0})
     summary.results["miou"] = math.nan
     summary.warnings.append("3 images were left out")
-    with output_folder(tmp_path / "out", summary=summary):
+    with summary.folder(tmp_path / "out"):
         pass
     record = json.loads((tmp_path / "out" / SUMMARY_NAME).read_text())
-    assert [record[key] for key in ("command", "settings")] == ["fuse", {"out": "x", "voxel": 0.02}]
+    assert (record["command"], record["settings"]["out"], record["settings"]["worker"]) == ("fuse", "x", 2)
     assert 0.52 <= record["timings"]["fuse"] < 5
     assert list(record["timings"]) == ["fuse", "fail", "seeds", "total"]
     assert record["results"] == {"miou": None}
@@ -74,7 +76,7 @@ def test_a_summary_records_what_the_run_did(tmp_path: Path) -> None:
 
 
 def test_a_summary_names_neither_the_machine_nor_the_user(tmp_path: Path) -> None:
-    text = json.dumps(Summary("fuse", {}).to_dict())
+    text = json.dumps(Run("fuse", SharedScenesConfig()).to_dict())
     assert os.uname().nodename not in text
     assert str(Path.home()) + os.sep not in text
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from gsencoder.app.commands.localize import add_words
 from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import peak_memory_mb
 from gsencoder.app.reports import add_features, add_views
 from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_bytes, write_json
+from gsencoder.core.process import peak_memory_mb
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed

@@ -25,6 +25,7 @@ from gsencoder.infer.page.report import HtmlReport
 from gsencoder.text.table import TextEncoder
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Cameras, Localization, QueryMemory, Scene
+from gsencoder.types.scene import concatenate_cameras
 
 FROM_POSE = "from_pose.json"
 
@@ -64,21 +65,23 @@ def run(config: LocalizeCommandConfig, run: Run) -> None:
         queried, table = queried_scene(
             scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )
-        cameras = requested_cameras(scene, config.pose, config.view)
+        cameras = requested_cameras(scene, config.pose, config.view) if config.pose or config.view else None
     with run.step("localize"):
         localization = localize(queried, words, table, config.localize)
-    out, boxes = run.out(scene.name, "boxes"), localization_to_json(localization)
+    space = next(iter(queried.features.values())).space.describe()
+    presences, boxes = words_to_json(localization), localization_to_json(localization)
     run.results.update(
-        space=next(iter(queried.features.values())).space.describe(),
+        space=space,
         boxes=boxes,
         thresholds=dict(zip(words, localization.thresholds.tolist(), strict=True)),
-        words=words_to_json(localization),
+        words=presences,
         metres_per_unit=scene.metres_per_unit,
     )
     points: list[dict[str, Any]] = []
+    out = run.out(scene.name, "boxes")
     with run.folder(out) as target:
         write_json(target / "boxes.json", boxes)
-        write_json(target / "words.json", run.results["words"])
+        write_json(target / "words.json", presences)
         write_boxes_ply(target / "boxes.ply", scene, localization)
         if config.pictures and scene.views is not None:
             from gsencoder.infer.pictures import relevancy_pictures
@@ -125,9 +128,9 @@ def _first_box(localization: Localization, word: str) -> str:
     )
 
 
-def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> tuple[Cameras, tuple[str | None, ...]] | None:
+def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> tuple[Cameras, tuple[str | None, ...]]:
     """The cameras of a file, followed by those of views of the scene, relative to its origin, and for each the name of
-    its view or None; None where neither is asked for."""
+    its view or None."""
     parts = [read_cameras(Path(pose), scene.origin)] if pose else []
     names: list[str | None] = [None] * sum(map(len, parts))
     row_of = {} if scene.views is None else {name: row for row, name in enumerate(scene.views.names)}
@@ -137,15 +140,7 @@ def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> tuple[Ca
             raise InputError(f"view: scene {scene.name} has no view {name[:80]!r}; {some}")
         parts.append(scene.views.cameras.select([row_of[name]]))
         names.append(name)
-    if not parts:
-        return None
-    cameras = Cameras(
-        cam_from_world=np.concatenate([part.cam_from_world for part in parts]),
-        Ks=np.concatenate([part.Ks for part in parts]),
-        widths=np.concatenate([part.widths for part in parts]),
-        heights=np.concatenate([part.heights for part in parts]),
-    )
-    return cameras, tuple(names)
+    return concatenate_cameras(parts), tuple(names)
 
 
 def search_from_poses(

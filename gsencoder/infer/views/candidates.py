@@ -5,7 +5,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,9 +19,10 @@ from gsencoder.data.seeding.points import NEIGHBOR
 from gsencoder.geometry import covariances, rotmats_from_quats
 from gsencoder.infer.views.photographs import photograph_cameras
 from gsencoder.infer.views.targets import CONSTANTS, Target, ViewsConfig
-from gsencoder.render import BlendConfig, blend
+from gsencoder.render import blend
 from gsencoder.types import Cameras, Gaussians, Scene
 from gsencoder.types.checks import look_rotation
+from gsencoder.types.scene import concatenate_cameras
 
 
 def closeups(
@@ -119,6 +120,7 @@ class FreeSpace:
 
     Attributes:
         cell: edge of the cells in which rays are followed, world units.
+        blend: accuracy of small renders of it, whose near plane is not beyond a cell.
         observers: the cameras that tell what is empty; None where there are none.
     """
 
@@ -128,13 +130,15 @@ class FreeSpace:
         solid = np.flatnonzero(gaussians.opacities >= CONSTANTS.min_obstacle_opacity)
         if not len(solid):
             solid = np.arange(len(gaussians))
-        self._gaussians, self._quats = gaussians, gaussians.quats[solid]
-        means = gaussians.means[solid].astype(np.float64)
+        obstacles = gaussians.select(solid)
+        self._gaussians, self._quats = gaussians, obstacles.quats
+        means = obstacles.means.astype(np.float64)
         sample = means[even_indices(len(means), CONSTANTS.spacing_sample)]
         distances = cKDTree(means).query(sample, k=[min(NEIGHBOR + 1, len(means))])[0]
         # Of a single Gaussian, and of many in one place, the size is known.
-        self.cell = CONSTANTS.cell_spacings * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))
-        self._patches = patches(gaussians.select(solid), self.cell)
+        self.cell = CONSTANTS.cell_spacings * (float(np.median(distances)) or float(np.median(obstacles.scales)))
+        self.blend = replace(CONSTANTS.score_blend, near=min(CONSTANTS.score_blend.near, self.cell / 2))
+        self._patches = patches(obstacles, self.cell)
         self._tree = cKDTree(self._patches.centers)
         # Floaters may be any distance away: what is beyond the middle's million cells on a side is met by no ray.
         self._low = np.floor(np.median(means, axis=0) / self.cell) - CONSTANTS.grid_cells // 2
@@ -143,7 +147,7 @@ class FreeSpace:
         self.observers: Cameras | None = None
         self._depths: list[Float32[np.ndarray, "h w"]] = []
 
-    def seen_by(self, cameras: Cameras, config: BlendConfig = BlendConfig()) -> "FreeSpace":
+    def seen_by(self, cameras: Cameras) -> "FreeSpace":
         """The same space, of which cameras tell what they looked through, by a depth map of each."""
         if not len(cameras):
             return self
@@ -151,9 +155,8 @@ class FreeSpace:
         small = other.observers = cameras.resized(CONSTANTS.free_space_side)
 
         def depth_map(view: int) -> Float32[np.ndarray, "h w"]:
-            b = blend(self._gaussians, small, view, config=config)
             # Rays that end nowhere have looked through nothing that is known.
-            return torch.where(b.alpha >= CONSTANTS.min_depth_alpha, b.depth, 0.0).reshape(b.shape).float().numpy()
+            return blend(self._gaussians, small, view, config=self.blend).depth_map(CONSTANTS.min_depth_alpha)
 
         other._depths = list(parallel(depth_map, range(len(small))))
         return other
@@ -323,7 +326,8 @@ def shell_cameras(
     there is no room."""
     focal = width / (2 * math.tan(math.radians(CONSTANTS.fov_degrees) / 2))
     outward, vertical = spiral_directions(max(CONSTANTS.tried_directions * count, CONSTANTS.min_tried_directions), up)
-    preferred, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height)
+    rotations = look_rotation(outward, vertical)
+    preferred, least, reach = _distances(gaussians, target, rotations, focal, width, height)
     # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
     begins = reach + 2 * free.cell
     starts = target.center + begins[:, None] * outward
@@ -367,8 +371,7 @@ def _background_fraction(
 def _distances(
     gaussians: Gaussians,
     target: Target,
-    outward: Float64[np.ndarray, "n 3"],
-    vertical: Float64[np.ndarray, "3"],
+    rotations: Float64[np.ndarray, "n 3 3"],
     focal: float,
     width: int,
     height: int,
@@ -380,8 +383,8 @@ def _distances(
     margin = CONSTANTS.fill_margin
     shares = np.clip(CONSTANTS.fill_shares, CONSTANTS.least_share * margin, CONSTANTS.most_share / margin)
     cell = max(target.radius / CONSTANTS.outline_cells, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
-    preferred, least, reach = (np.empty(len(outward)) for _ in range(3))
-    for index, (right, down, direction) in enumerate(look_rotation(outward, vertical)):
+    preferred, least, reach = (np.empty(len(rotations)) for _ in range(3))
+    for index, (right, down, direction) in enumerate(rotations):
         plane = np.stack((offsets @ right, offsets @ down), axis=1)
         area = len(np.unique(np.floor(plane / cell).astype(np.int64), axis=0)) * cell**2
         reach[index] = max(float((offsets @ direction).max()), 0.0)
@@ -412,7 +415,7 @@ Placed = tuple[Cameras, list[str], list[int | None]]
 
 def uniform_candidates(scene: Scene, gaussians: Gaussians, config: ViewsConfig) -> Placed:
     """Evenly spread frames, or cameras around a splat that has none."""
-    if scene.views is None or not len(scene.views):
+    if scene.views is None:
         around = orbit_cameras(
             gaussians,
             count=config.count,
@@ -423,7 +426,7 @@ def uniform_candidates(scene: Scene, gaussians: Gaussians, config: ViewsConfig) 
         )
         return around, [f"orbit {number:02d}" for number in range(len(around))], [None] * len(around)
     chosen = even_indices(len(scene.views), config.count)
-    cameras = _downscaled(scene.views.cameras.select(chosen), config)
+    cameras = scene.views.cameras.select(chosen).resized(config.frame_side, enlarge=False)
     return cameras, [scene.views.names[view] for view in chosen], chosen.tolist()
 
 
@@ -433,11 +436,10 @@ def target_candidates(
     targets: Sequence[Target],
     free: FreeSpace,
     config: ViewsConfig,
-    blend: BlendConfig,
 ) -> Placed:
     """Frames that show the targets, close-ups cut from them, and cameras on shells around the targets."""
     total = max(config.candidates, config.count)
-    views = scene.views if scene.views is not None and len(scene.views) else None
+    views = scene.views
     if config.source == "frames" and views is None:
         raise InputError(f"views: scene {scene.name} has no cameras; use choose.source=shells")
     names: list[str] = []
@@ -455,14 +457,14 @@ def target_candidates(
                 names += [f"{views.names[view]} near {target.name}" for view in best[rows]]
                 frames += best[rows].tolist()
         whole = frames_on(views.cameras, gaussians, targets, room - len(frames), spaces)
-        parts.append(_downscaled(views.cameras.select(whole), config))
+        parts.append(views.cameras.select(whole).resized(config.frame_side, enlarge=False))
         names += [views.names[view] for view in whole]
         frames += whole.tolist()
     if config.source != "frames":
         if views is not None:
             count = max(CONSTANTS.free_space_cameras, len(targets))
             observers = frames_on(views.cameras, gaussians, targets, count, spaces)
-            free = free.seen_by(views.cameras.select(observers), blend)
+            free = free.seen_by(views.cameras.select(observers))
         up = up_of(scene)
         for target, room in zip(targets, _split_evenly(total - len(frames), len(targets)), strict=True):
             space = free.without(target.rows)
@@ -478,14 +480,7 @@ def target_candidates(
             f"views: there is no room for a camera around {', '.join(target.name for target in targets)} "
             f"(pictures of {config.width} x {config.height} pixels); {remedy}"
         )
-    fields = ("cam_from_world", "Ks", "widths", "heights")
-    cameras = Cameras(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})
-    return cameras, names, frames
-
-
-def _downscaled(frames: Cameras, config: ViewsConfig) -> Cameras:
-    """Frames at the size of their pictures: photographs have far more pixels than anyone looks at."""
-    return frames.resized(config.frame_side, enlarge=False)
+    return concatenate_cameras(parts), names, frames
 
 
 def _split_evenly(total: int, parts: int) -> list[int]:

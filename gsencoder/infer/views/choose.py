@@ -274,15 +274,14 @@ def choose_views(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Candidates:
-    """Cameras, what they are called, which frames they are (None for those that were placed in the free space), what
-    they show of each target, and the accuracy of the small renders."""
+    """Cameras, what they are called, which frames they are (None for those that were placed in the free space), and
+    what they show of each target."""
 
     cameras: Cameras
     names: list[str]
     frames: list[int | None]
     scores: tuple[ViewScores, ...]
     free: FreeSpace
-    blend: BlendConfig
 
 
 def score_candidates(
@@ -294,21 +293,19 @@ def score_candidates(
         raise InputError(f"views: scene {scene.name} has no Gaussians")
     if not targets and config.method == "greedy":
         raise InputError("views: there is nothing to look at; give one target or more")
-    for target in targets:
-        if target.rows.min() < 0 or target.rows.max() >= len(gaussians):
-            raise InputError(f"views: {target.name!r} has Gaussians beyond the {len(gaussians):,} of the splat")
-    free = free or FreeSpace(gaussians)
     scene = with_upright_frames(scene)
-    blend = replace(CONSTANTS.score_blend, near=min(CONSTANTS.score_blend.near, free.cell / 2))
+    if scene.views is not None and not len(scene.views):
+        scene = replace(scene, views=None)
+    free = free or FreeSpace(gaussians)
     if config.method == "uniform":
         cameras, names, frames = uniform_candidates(scene, gaussians, config)
     else:
-        cameras, names, frames = target_candidates(scene, gaussians, targets, free, config, blend)
-    scores = score_views(gaussians, cameras, targets, side=config.judged_side, config=blend)
+        cameras, names, frames = target_candidates(scene, gaussians, targets, free, config)
+    scores = score_views(gaussians, cameras, targets, side=config.judged_side, config=free.blend)
     if scene.views is not None and scene.views.images is not None:
         is_photograph = np.array([frame is not None for frame in frames])
         scores = tuple(replace_with_photographs(each, is_photograph) for each in scores)
-    return Candidates(cameras=cameras, names=names, frames=frames, scores=scores, free=free, blend=blend)
+    return Candidates(cameras=cameras, names=names, frames=frames, scores=scores, free=free)
 
 
 def view_set(
@@ -350,5 +347,5 @@ def view_set(
             for position, view in enumerate(order.tolist())
         ),
         judged=len(candidates.cameras),
-        near=candidates.blend.near,
+        near=candidates.free.blend.near,
     )
