@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from json_option import add_json_option, write_figures
 
-from gsencoder.app.scenes import queried_scene
+from gsencoder.app.scenes import load_query
 from gsencoder.core.errors import SceneWarning
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, localize
@@ -42,7 +42,7 @@ def main() -> None:
     config, errors, lines = ViewsConfig(), [float(each) for each in given.errors.split(",")], []
     for folder in given.folders:
         scene = load_features(folder)
-        queried, words = queried_scene(scene, folder)
+        queried, words = load_query(scene, folder)
         gaussians = scene.gaussians
         if given.scenes is None:
             names = given.queries.split(",")

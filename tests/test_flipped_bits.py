@@ -30,7 +30,7 @@ from gsencoder.app.output import output_file, output_folder
 from gsencoder.app.run import Run, _is_finished
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files import check_written, checksums_of, sealed, write_bytes, write_json
+from gsencoder.core.files import checksums_of, warn_if_modified, with_checksum, write_bytes, write_json
 from gsencoder.data.labels.files import read_checked
 from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
 from gsencoder.data.readers.transforms_json import read_json
@@ -201,7 +201,7 @@ def prompts(folder: Path, name: str) -> Made:
 
 def answers(folder: Path) -> Made:
     row = {"id": "1", "digest": "d", "answer": "On the left.", "tokens": {"prompt": 7}, "seconds": 0.25}
-    write_bytes(folder / ANSWERS, json.dumps(sealed(row)).encode() + b"\n")
+    write_bytes(folder / ANSWERS, json.dumps(with_checksum(row)).encode() + b"\n")
     (folder / "d").mkdir()
     # A question whose answer is not recognized is asked again.
     return folder / ANSWERS, lambda: _answered(folder, {"1": "d"}) or {"1": row}
@@ -319,5 +319,5 @@ def test_a_summary_without_checksums_says_nothing_of_files(content: str, tmp_pat
     (tmp_path / "a").write_text("x")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_written(tmp_path / "a")
-        check_written(tmp_path / "missing")
+        warn_if_modified(tmp_path / "a")
+        warn_if_modified(tmp_path / "missing")

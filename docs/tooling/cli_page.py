@@ -31,7 +31,7 @@ from gsencoder.app.options import (
     section_classes,
     union_members,
 )
-from gsencoder.core.settings import shown_value
+from gsencoder.core.settings import format_value
 
 PAGE = Path(__file__).resolve().parents[1] / "cli.md"
 HEAD = """\
@@ -164,7 +164,7 @@ def anchor(section: Section) -> str:
 def presets(cls: type[CommonConfig]) -> list[str]:
     sets = []
     for name in PRESETS:
-        changes = ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, name).items())
+        changes = ", ".join(f"{key}={format_value(value)}" for key, value in preset_values(cls, name).items())
         sets += [f"`{PRESET}={name}` sets {escaped(changes)}"] if changes else []
     return [f"Presets: {'; '.join(sets)}.", ""] if sets else []
 

@@ -384,15 +384,15 @@ def _section(annotation: Any, value: Any, key: str) -> Any:
     if not isinstance(value, Mapping):
         raise InputError(f"{key}: is a section with options of its own ({key}.NAME=…), got {value!r}")
     if len(classes) == 1:
-        return typed(classes[0], value, key + ".")
+        return from_dict(classes[0], value, key + ".")
     by_name = {member_name(section): section for section in classes}
     name = str(value.get("name"))
     if name not in by_name:
         raise InputError(f"{key}.name: expected one of {', '.join(by_name)}, got {name!r}{near(name, by_name)}")
-    return typed(by_name[name], value, key + ".")
+    return from_dict(by_name[name], value, key + ".")
 
 
-def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
+def from_dict(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
     """Builds settings from plain dicts, lists and scalars; missing options have their defaults."""
     import dacite
     from dacite.exceptions import DaciteFieldError
@@ -445,7 +445,7 @@ def compose(
             raise InputError(hydra_error(error, texts, choices)) from error
         data = plain_settings(composed)
         check_single(data, texts, choices)
-        return typed(cls, data)
+        return from_dict(cls, data)
 
 
 def plain_settings(composed: Any) -> dict[str, Any]:
@@ -475,7 +475,7 @@ def _job(
     try:
         data = plain_settings(composed)
         check_single(data, texts, choices)
-        config = typed(cls, data)
+        config = from_dict(cls, data)
     except InputError as error:
         message = f"run {job.job.num}: {error}"
         print(one_line(f"error: {message}"), file=sys.stderr)
@@ -489,7 +489,7 @@ def _job(
     return run(config if shared else replace(config, out=config.out / str(job.job.num)))
 
 
-def run_many(
+def run_sweep(
     command: str,
     cls: type[CommonConfig],
     words: Sequence[str],

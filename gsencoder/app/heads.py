@@ -27,7 +27,7 @@ def queried_through_head(
     scene: Scene, folder: Path, head: str, *, space: str, words_file: str, text: TextConfig
 ) -> tuple[Scene, Words]:
     """A scene with the outputs of a head as its only features, and the words that they are compared with; arguments and
-    errors are those of `gsencoder.app.scenes.queried_scene`."""
+    errors are those of `gsencoder.app.scenes.load_query`."""
     heads = heads_of_folder(folder, head)
     measured_head = find_head(heads, head)
     words = words_of_head(measured_head.head, words_file, text)

@@ -155,8 +155,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fault_of_system(error: OSError) -> str | None:
-    """The line for an error of the system and not of the program: a full or broken disk, or a file that has gone or may
-    not be read since it was looked at. None for any other."""
+    """The line for a full or broken disk, or a file that has gone or may not be read; None for any other error."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"{error.filename or 'standard output'}: no space left on the device"
     if error.filename is not None and error.strerror is not None:
@@ -239,12 +238,12 @@ def _dispatch(words: Sequence[str], began: float) -> int:
         print(command_help(command.name, command.help, cls, FLAGS))
         return 0
     # It needs Hydra, which takes a while to load.
-    from gsencoder.app.compose import compose, run_many
+    from gsencoder.app.compose import compose, run_sweep
 
     if "--multirun" in flags:
         if "--cfg" in flags:
             raise InputError("--cfg: shows one run; leave out -m")
-        return run_many(name, cls, words, partial(_run_one, command, debug="--debug" in flags))
+        return run_sweep(name, cls, words, partial(_run_one, command, debug="--debug" in flags))
     config = compose(name, cls, words)
     if "--cfg" in flags:
         from omegaconf import OmegaConf

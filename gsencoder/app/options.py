@@ -27,7 +27,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
-from gsencoder.core.settings import CheckedConfig, option, shown_value
+from gsencoder.core.settings import CheckedConfig, format_value, option
 
 Kind = Literal["text", "list", "value"]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -414,7 +414,7 @@ RULES = (
 )
 
 
-def _shown(value: Any) -> str:
+def _format_default(value: Any) -> str:
     if value == "":
         return "empty"
     if isinstance(value, tuple):
@@ -429,7 +429,7 @@ def _entry(head: str, text: str, width: int) -> list[str]:
 
 def _option(option: Option, width: int) -> list[str]:
     kind = option.metavar or describe(option.annotation)
-    return _entry(f"{option.key}={kind}", f"{option.help} [{_shown(option.default)}]", width)
+    return _entry(f"{option.key}={kind}", f"{option.help} [{_format_default(option.default)}]", width)
 
 
 def command_help(
@@ -450,11 +450,11 @@ def command_help(
         lines += ["", "choices:"]
         for group, members in groups.items():
             text = next((str(each.metadata.get("help", "")) for each in fields(cls) if each.name == group), "")
-            meaning = f"{text} [{_shown(choices.chosen[group])}]".strip()
+            meaning = f"{text} [{_format_default(choices.chosen[group])}]".strip()
             lines += _entry(f"{group}={'|'.join(members)}", meaning, width)
     lines += ["", f"presets [{DEFAULT_PRESET}]:"]
     for preset in PRESETS:
-        changes = ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, preset).items())
+        changes = ", ".join(f"{key}={format_value(value)}" for key, value in preset_values(cls, preset).items())
         nothing = "the defaults" if preset == DEFAULT_PRESET else "changes nothing in this command"
         lines += _entry(f"{PRESET}={preset}", changes or nothing, width)
     lines += ["", "settings [default]:"]

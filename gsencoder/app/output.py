@@ -97,7 +97,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, record: Record |
             write_bytes(partial / SUMMARY_NAME, json_bytes(written)[0])
         _sync(partial)
         _check_target(path, target, overwrite)
-        _move_into_place(partial, target)
+        _replace_target(partial, target)
     except Exception as error:
         message = _refusal(error, partial, target, path)
         if message is None:
@@ -115,9 +115,9 @@ def _hidden(target: Path, suffix: str) -> Path:
 
 
 def _begin(path: str | Path, target: Path, overwrite: bool) -> tuple[Path, int | None]:
-    """Creates and locks the hidden folder. Runs that start at the same moment do so one after the other: a folder that
-    is created and not yet locked would be mistaken for that of a killed run."""
+    """Creates and locks the hidden folder."""
     backup, partial = _hidden(target, "earlier"), _hidden(target, f"partial-{secrets.token_hex(4)}")
+    # One run after the other: a folder that is created and not yet locked would be mistaken for that of a killed run.
     parent_lock = lock_folder(target.parent, wait=True)
     try:
         if _remove_stale(target):
@@ -187,8 +187,7 @@ def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _remove_stale(target: Path) -> bool:
-    """Removes the hidden folders of killed runs beside `target`; returns whether another run is writing it now. Where
-    folders cannot be locked (some network file systems) nothing is removed and no run is detected."""
+    """Removes the hidden folders of killed runs, where folders can be locked; returns whether a run is writing now."""
     pattern = re.compile(re.escape(_hidden(target, "partial-").name) + "[0-9a-f]{8}")
     for entry in list(os.scandir(target.parent)):
         if not pattern.fullmatch(entry.name) or not entry.is_dir(follow_symlinks=False):
@@ -226,7 +225,7 @@ def _sync_one(path: str | Path) -> None:
         os.close(descriptor)
 
 
-def _move_into_place(partial: Path, target: Path) -> None:
+def _replace_target(partial: Path, target: Path) -> None:
     """Renames `partial` to `target`; an existing `target` is renamed to `partial`."""
     old = target.is_dir() and any(target.iterdir())
     if old and not _exchange(partial, target):
@@ -349,8 +348,7 @@ class WorkFolder:
         self._taken = True
 
     def _discard(self) -> None:
-        """Removes everything but a marker of another name: the next run removes what a kill leaves of the state, and
-        does not continue from a part of it."""
+        """Removes everything but a marker of another name, by which the next run removes what a kill leaves of it."""
         with suppress(FileNotFoundError):
             os.replace(self.path / MARKER_FILE, self.path / DISCARDED_FILE)
         for entry in self.path.iterdir():

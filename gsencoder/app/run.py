@@ -33,7 +33,7 @@ from gsencoder.core.budget import Budget
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, listed, one_line, printable
 from gsencoder.core.files import SUMMARY_NAME, plain, read_foreign_text
 from gsencoder.core.process import Device, ProcessRank, peak_memory_mb, refuse_several
-from gsencoder.core.settings import describe_values, shown_value
+from gsencoder.core.settings import describe_values, format_value
 from gsencoder.core.threads import available_cores
 from gsencoder.data.scenes import check_names, scene_name
 from gsencoder.data.up import Up
@@ -238,11 +238,11 @@ class Run:
         lines = []
         for name, limit in limits.items():
             if name not in measured:
-                lines.append(f"budget.{name}: limit {shown_value(limit)}, not measured (budget.check=false)")
+                lines.append(f"budget.{name}: limit {format_value(limit)}, not measured (budget.check=false)")
             elif measured[name] <= limit:
-                lines.append(f"budget.{name}: limit {shown_value(limit)}, measured {measured[name]:.4g}")
+                lines.append(f"budget.{name}: limit {format_value(limit)}, measured {measured[name]:.4g}")
             else:
-                text = f"budget.{name}: the limit is {shown_value(limit)}, and it became {measured[name]:.4g}"
+                text = f"budget.{name}: the limit is {format_value(limit)}, and it became {measured[name]:.4g}"
                 warnings.warn(text, SceneWarning, stacklevel=3)
         return lines
 

@@ -47,7 +47,7 @@ def _lines_of(file: Path) -> list[str]:
         raise InputError(f"queries: {file} cannot be read as text: {error}") from error
 
 
-def queried_scene(
+def load_query(
     scene: Scene,
     folder: Path,
     *,
@@ -68,7 +68,7 @@ def queried_scene(
     return replace(scene, features={features.space.name: features}), words
 
 
-def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
+def load_feature_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
     """Loads a folder of features, with the photographs of the scene `photos` if one is given."""
     scene = load_features(folder)
     return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
@@ -101,8 +101,7 @@ def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextCon
 
 
 def _find_table(folder: Path, space: FeatureSpace) -> TextTable | None:
-    """The table of a space in a folder of features; None where it is lost, damaged or of another space, for which
-    words= and text= stand in."""
+    """The table of a space in a folder of features; None where it is lost, damaged or of another space."""
     try:
         path = table_path(folder, space.text_encoder)
         table = None if path is None else load_text_table(path)

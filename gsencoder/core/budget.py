@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import shown_value, value_at
+from gsencoder.core.settings import format_value, value_at
 
 UNITS = {"error": "", "seconds": " s", "megabytes": " MB"}
 """The limits of a budget with their units. Where limits conflict, the one that stands first wins."""
@@ -54,7 +54,7 @@ class Budget:
 
     def option(self, name: str) -> str:
         """A limit as it is written on the command line."""
-        return f"budget.{name}={shown_value(self.limit(name))}"
+        return f"budget.{name}={format_value(self.limit(name))}"
 
     def conflict(self, other: str, needed: float) -> str:
         """The warning where the limit of error takes more seconds or megabytes than their limit."""
@@ -81,7 +81,7 @@ def reject_options_set_by_budget(
     for key in keys if budget.limits else ():
         if (value := value_at(settings, key)) != value_at(default, key):
             raise InputError(
-                f"{section}.{key}={shown_value(value)}: is chosen by {budget.options}; leave it (or the preset that "
+                f"{section}.{key}={format_value(value)}: is chosen by {budget.options}; leave it (or the preset that "
                 "sets it) out, or the budget"
             )
 

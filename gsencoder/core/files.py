@@ -69,7 +69,7 @@ def is_full_disk(error: BaseException) -> bool:
 
 
 @contextmanager
-def temporary_beside(target: Path) -> Iterator[Path]:
+def temporary_file(target: Path) -> Iterator[Path]:
     """A file of a hidden name in the folder of `target`, to write and then to rename to it; it is removed at the end of
     the block if it is still there. The name is the same every time, so that the next run writes over what a killed one
     left. The file is locked; a second run that writes the same target meanwhile gets a name of its own."""
@@ -105,8 +105,7 @@ def short_name(name: str) -> str:
 
 
 def _locked_file(path: Path) -> int | None:
-    """Creates an empty file, or empties that of a killed run, and locks it; None if another run has it, or files cannot
-    be locked here."""
+    """Makes and locks an empty file, or empties that of a killed run; None if it is locked, or files cannot be."""
     if fcntl is None:
         return None
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
@@ -135,7 +134,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     target = Path(path)
     with _named_errors(target):
         _check_folder(target)
-        with temporary_beside(target) as temporary:
+        with temporary_file(target) as temporary:
             with open(temporary, "wb") as stream:
                 yield stream
                 stream.flush()
@@ -150,7 +149,7 @@ def check_writable(path: str | Path) -> None:
         _check_folder(target)
         with suppress(FileNotFoundError):
             os.lstat(target)  # The temporary name is shorter where this one is too long.
-        with temporary_beside(target) as temporary, open(temporary, "wb"):
+        with temporary_file(target) as temporary, open(temporary, "wb"):
             pass
 
 
@@ -344,7 +343,7 @@ def _is_archive(path: Path) -> bool:
         return length <= LARGEST_HEADER and b'"gsencoder"' in stream.read(length)
 
 
-def check_written(path: str | Path) -> None:
+def warn_if_modified(path: str | Path) -> None:
     """Warns if a file differs from the checksum that the run which wrote it left in its summary, in the file's folder
     or above, or in FILE.summary.json; a file without one is not checked."""
     file = Path(path).absolute()
@@ -380,17 +379,17 @@ SUM = "sum"
 """The key of the checksum, which rows have for nothing else."""
 
 
-def sealed(row: Mapping[str, Any]) -> dict[str, Any]:
+def with_checksum(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row with its checksum: the first 16 digits of the SHA-256 of its JSON with sorted keys."""
     return {**row, SUM: sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()[:16]}
 
 
-def unsealed(row: Any) -> dict[str, Any]:
+def without_checksum(row: Any) -> dict[str, Any]:
     """A row without its checksum."""
     if not isinstance(row, dict):
         raise ValueError("the row is no object")
     plain = {name: value for name, value in row.items() if name != SUM}
-    if row != sealed(plain):
+    if row != with_checksum(plain):
         raise ValueError("the row is not as it was written")
     return plain
 

@@ -132,7 +132,7 @@ def load_pretrained(loader: Any, folder: Path, subject: str, *, ignored: Sequenc
     return _checked(folder, model, report, subject, ignored)
 
 
-def load_part(loader: Any, config: Any, folder: Path, weight: str, subject: str) -> tuple[Any, list[Path]]:
+def load_component(loader: Any, config: Any, folder: Path, weight: str, subject: str) -> tuple[Any, list[Path]]:
     """A part of the model of a folder, such as the tower of a vision-language model, and the files of its weights.
 
     No other weights are read.

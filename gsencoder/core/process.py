@@ -198,8 +198,7 @@ def first_host(nodes: str) -> str:
 
 
 def _local_tasks(environment: Mapping[str, str]) -> int:
-    """The number of tasks on this node, the first of a list such as `8(x3),4`: a step's nodes rarely differ, and fewer
-    threads than cores are no error."""
+    """The number of tasks on this node, the first of a list such as `8(x3),4`: a step's nodes rarely differ."""
     tasks = environment.get("SLURM_STEP_TASKS_PER_NODE") or environment.get("SLURM_TASKS_PER_NODE", "1")
     match = re.match(r"\d+", tasks)
     return int(match[0]) if match else 1

@@ -136,10 +136,10 @@ def exact_settings(settings: Settings, knobs: Sequence[Knob]) -> Settings:
 
 def describe_values(values: Mapping[str, Any]) -> str:
     """Values of knobs as one line, such as `views=8, rays=16`; `defaults` where there are none."""
-    return ", ".join(f"{name}={shown_value(value)}" for name, value in values.items()) or "defaults"
+    return ", ".join(f"{name}={format_value(value)}" for name, value in values.items()) or "defaults"
 
 
-def shown_value(value: Any) -> str:
+def format_value(value: Any) -> str:
     """A value as it is written in tables and options."""
     if isinstance(value, bool):
         return "true" if value else "false"

@@ -18,7 +18,7 @@ from PIL import Image
 
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, readable
-from gsencoder.core.files import MODEL_BYTES, read_foreign, sealed, unsealed, write_bytes
+from gsencoder.core.files import MODEL_BYTES, read_foreign, with_checksum, without_checksum, write_bytes
 
 PROMPTS_FILE, PICTURES_FOLDER, TOKENS_FOLDER = "prompts.jsonl", "pictures", "tokens"
 
@@ -50,7 +50,7 @@ class PromptStore:
         self._end = sum(len(line) + 1 for line in lines)
         for number, line in enumerate(lines, start=1):
             try:
-                row = unsealed(json.loads(line))
+                row = without_checksum(json.loads(line))
                 key, pictures = row.pop("key"), tuple(row.pop("pictures"))
                 names = (*pictures, row["tokens"]) if row["tokens"] else pictures
                 if not pictures or any(Path(name).name != name or name == ".." for name in names):
@@ -73,7 +73,7 @@ class PromptStore:
         names = tuple(self._write_picture(each) for each in pictures)
         file = "" if tokens is None else self._write_tokens(tokens)
         prompt = StoredPrompt(text=text, pictures=names, tokens=file, space=space)
-        line = json.dumps(sealed({"key": key, **asdict(prompt)}), ensure_ascii=False).encode() + b"\n"
+        line = json.dumps(with_checksum({"key": key, **asdict(prompt)}), ensure_ascii=False).encode() + b"\n"
         path = self.folder / PROMPTS_FILE
         try:
             path.touch()

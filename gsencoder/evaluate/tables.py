@@ -39,7 +39,7 @@ class ResultTable:
         """One mapping a row, with None for what is missing."""
         return [
             {"source": row.source, "group": row.group, "method": row.method}
-            | {column: _known(row.values.get(column)) for column in self.columns}
+            | {column: _finite(row.values.get(column)) for column in self.columns}
             for row in self.rows
         ]
 
@@ -107,12 +107,12 @@ def published_rows(name: str) -> tuple[ResultRow, ...]:
         )
 
 
-def _known(value: float | None) -> float | None:
+def _finite(value: float | None) -> float | None:
     return None if value is None or math.isnan(value) else value
 
 
 def _figure(row: ResultRow, column: str) -> str:
-    figure = _known(row.values.get(column))
+    figure = _finite(row.values.get(column))
     return "" if figure is None else f"{figure:.1f}"
 
 
@@ -156,7 +156,7 @@ def spread(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> dict[st
     """Mean and standard deviation over scenes, the rows, of columns, and the number of scenes that have a value."""
     figures: dict[str, dict[str, float | int]] = {}
     for column in columns:
-        values = [value for row in rows if (value := _known(row.get(column))) is not None]
+        values = [value for row in rows if (value := _finite(row.get(column))) is not None]
         deviation = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
         figures[column] = {"scenes": len(values), "mean": mean_of(values), "std": deviation}
     return figures

@@ -181,10 +181,8 @@ def draw_boxes(
     labels: list[tuple[np.ndarray, str, tuple[int, int, int]]] = []
     # The best box of a word is drawn last, over the others.
     for box in sorted(boxes, key=lambda each: -each.rank):
-        corners = box_corners(box)
-        if origin is not None:
-            corners = corners - origin
-        segments = _project_edges(transform(pose, corners), intrinsics, image.width, image.height)
+        corners = box_corners(box) if origin is None else box_corners(box) - origin
+        segments = _project_edges(pose, corners, intrinsics, image.width, image.height)
         if not segments:
             continue
         color = word_color(order[box.query])
@@ -198,12 +196,16 @@ def draw_boxes(
 
 
 def _project_edges(
-    corners: Float64[np.ndarray, "8 3"], intrinsics: Float64[np.ndarray, "3 3"], width: int, height: int
+    pose: Float64[np.ndarray, "4 4"],
+    corners: Float64[np.ndarray, "8 3"],
+    intrinsics: Float64[np.ndarray, "3 3"],
+    width: int,
+    height: int,
 ) -> list[np.ndarray]:
     """The visible part [2, 2] of each edge, in pixels; edges outside the picture are left out."""
-    segments = []
+    segments, local = [], transform(pose, corners)
     for a, b in EDGES:
-        start, end = corners[a], corners[b]
+        start, end = local[a], local[b]
         if max(start[2], end[2]) <= NEAR:
             continue
         if min(start[2], end[2]) < NEAR:

@@ -73,7 +73,7 @@ BINS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
+class SampledRegion:
     """A part of the scene, of `rows` Gaussians, that was encoded whole, and in halves where the scene is cut.
 
     Attributes:
@@ -261,7 +261,7 @@ class SampledEncoding:
         return float(_errors(rounded, exact).mean())
 
     @cached_property
-    def _parts(self) -> list[Part]:
+    def _parts(self) -> list[SampledRegion]:
         """Parts that are encoded whole, and in halves where the scene is cut into chunks."""
         count = max(min(len(self._gaussians) // SHARE, MOST_ROWS), LEAST_ROWS)
         precisions = dict.fromkeys(setting.precision for setting in self.settings)
@@ -282,7 +282,7 @@ class SampledEncoding:
                 regions = scene_regions(part.means, self._encoder.voxel / self._unit)
                 seen = seen_around(part.means, cut(part.means, halves.chunk, 0.0, regions)) * self._unit
                 distances, cutting = _never_rising(seen, errors)
-            parts.append(Part(rows=len(part), seconds=seconds, distances=distances, cutting=cutting))
+            parts.append(SampledRegion(rows=len(part), seconds=seconds, distances=distances, cutting=cutting))
         return parts
 
     def _encode(self, part: Gaussians, config: EncodeConfig) -> dict[str, GaussianFeatures]:

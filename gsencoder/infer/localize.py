@@ -303,18 +303,18 @@ def cluster_by_gaps(points: Float32[np.ndarray, "n 3"], smallest: float, min_sam
         radius *= GROWTH
     labels = cluster(points, radius, min_samples)
     largest = np.argsort(-np.bincount(labels[labels >= 0]), kind="stable")[:MAX_PARTS]
-    parts = [_Part(points, np.flatnonzero(labels == label)) for label in largest]
+    parts = [_ClusterUnion(points, np.flatnonzero(labels == label)) for label in largest]
     belong = cache(partial(_belong_together, widest=WIDEST * radius))
     while pair := next((pair for pair in combinations(parts, 2) if belong(*pair)), None):
         rows = np.concatenate([part.rows for part in pair])
-        parts = [part for part in parts if part not in pair] + [_Part(points, rows)]
+        parts = [part for part in parts if part not in pair] + [_ClusterUnion(points, rows)]
         parts.sort(key=lambda part: -len(part.rows))
     for part in parts:
         labels[part.rows] = labels[part.rows].min()
     return np.unique(np.append(labels, -1), return_inverse=True)[1][:-1].astype(np.int64) - 1
 
 
-class _Part:
+class _ClusterUnion:
     """A cluster, or several that were joined."""
 
     def __init__(self, points: Float32[np.ndarray, "N 3"], rows: Int64[np.ndarray, " n"]) -> None:
@@ -329,7 +329,7 @@ class _Part:
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
-def _belong_together(larger: _Part, smaller: _Part, widest: float) -> bool:
+def _belong_together(larger: _ClusterUnion, smaller: _ClusterUnion, widest: float) -> bool:
     if len(smaller.rows) < STRAY * len(larger.rows):
         return False
     limit = min(GAP * max(larger.size, smaller.size), widest)

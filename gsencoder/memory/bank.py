@@ -251,8 +251,7 @@ class _Builder:
         return chosen
 
     def _score(self, components: Float32[np.ndarray, "M D"], threshold: float) -> tuple[float, float]:
-        """The share of features with a component within the threshold, and the mean cosine with the nearest one.
-        Features without a direction count as covered where the bank has a component without one."""
+        """The share of features with a component within the threshold, and the mean cosine with the nearest one."""
         keys = components - self._mean
         directed_keys = np.abs(keys).max(axis=1) * np.sqrt(keys.shape[1]) > self._floor
         unit = unit_rows(keys[directed_keys])

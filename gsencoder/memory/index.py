@@ -68,7 +68,7 @@ class IndexMemory:
     lowest: float
 
 
-class TooManyRowsError(InputError):
+class RowLimitError(InputError):
     """A table would have more rows than it may."""
 
 
@@ -132,7 +132,7 @@ def _leaders(
         )
     if len(leaders) > limit:
         if not search:
-            raise TooManyRowsError(f"index: a table of threshold {threshold:g} has more than {limit:,} rows")
+            raise RowLimitError(f"index: a table of threshold {threshold:g} has more than {limit:,} rows")
         fits = largest_threshold(lambda each: len(cover(each, limit)) <= limit)
         raise InputError(
             f"index: a table with a row within {threshold:g} of every feature has more than {limit:,} rows; give "
@@ -216,7 +216,7 @@ def index_within(
     for number in numbers[first:] if budget.error is not None else numbers[first::-1]:
         try:
             indexed = _indexed(features, number, MAX_ROWS)
-        except TooManyRowsError:
+        except RowLimitError:
             if budget.error is not None:
                 break
             continue

@@ -149,10 +149,11 @@ def visible_shares(
     starts = np.concatenate(([0], np.cumsum([len(group) for group in chosen]))).astype(np.int64)
     members = np.concatenate([np.empty(0, np.int64), *chosen])
     poses, Ks = cameras.cam_from_world.astype(np.float64), cameras.Ks.astype(np.float64)
+    centers = cameras.centers
 
     def work(view: int) -> np.ndarray:
         size = int(cameras.widths[view]), int(cameras.heights[view])
-        distances = np.linalg.norm(gaussians.means[:: max(1, len(gaussians) // 1000)] - cameras.centers[view], axis=1)
+        distances = np.linalg.norm(gaussians.means[:: max(1, len(gaussians) // 1000)] - centers[view], axis=1)
         near = NEAR * float(np.median(distances)) if len(distances) else 0.0
         return np.asarray(
             _shares(gaussians.means, radii, rows, growth, members, starts, poses[view], Ks[view], size, near)

@@ -15,7 +15,7 @@ from gsencoder.core.pretrained import (
     ANY,
     digest_files,
     find_file,
-    load_part,
+    load_component,
     load_pretrained,
     read_config,
     weight_names,
@@ -263,7 +263,7 @@ class VisionTower(nn.Module):
 
         if tower.cut_out:
             loader = getattr(transformers, self._kind.loader)
-            self._model, files = load_part(loader, config, folder, self._kind.weight, WHAT)
+            self._model, files = load_component(loader, config, folder, self._kind.weight, WHAT)
         else:
             projects = "WithProjection" if self._head == "projection" else ""
             loader = getattr(transformers, self._kind.loader + projects)

@@ -22,7 +22,7 @@ from torch.utils.data import Dataset
 
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import check_written, plain
+from gsencoder.core.files import plain, warn_if_modified
 from gsencoder.core.pretrained import load_pretrained
 from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.core.settings import option
@@ -400,7 +400,7 @@ def open_tuned(folder: Path, model: Path, *, with_tokens: bool = False) -> Tuned
     if not (folder / "adapter_model.safetensors").is_file():
         raise InputError(f"{WHAT}: {folder} has no adapter_model.safetensors; expected what tune wrote")
     for name in ("adapter_model.safetensors", "adapter_config.json"):
-        check_written(folder / name)
+        warn_if_modified(folder / name)
     base = load_pretrained(AutoModelForImageTextToText, model.resolve(), WHAT)
     with quiet_peft():
         adapted = peft.PeftModel.from_pretrained(base, str(folder), use_safetensors=True)

@@ -11,7 +11,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from gsencoder.app import main as cli
-from gsencoder.app.compose import compose, join_list, split_list, typed
+from gsencoder.app.compose import compose, from_dict, join_list, split_list
 from gsencoder.app.main import COMMANDS, check_required
 from gsencoder.app.options import (
     HIDDEN,
@@ -174,7 +174,7 @@ def test_required_settings_are_asked_for_by_name(conf: Path) -> None:
 
 def test_settings_read_back_are_the_same_settings(conf: Path) -> None:
     config = toy(conf, "scene", "teacher=onnx", "query=a,b", "tau=0.1", "out=x")
-    assert typed(ToyConfig, settings(config)) == config
+    assert from_dict(ToyConfig, settings(config)) == config
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_settings_read_back_are_the_same_settings(conf: Path) -> None:
 )
 def test_wrong_yaml_is_told_like_a_wrong_command_line(data: dict[str, Any], problem: str) -> None:
     with pytest.raises(InputError) as caught:
-        typed(ToyConfig, data)
+        from_dict(ToyConfig, data)
     assert problem in str(caught.value)
 
 
@@ -226,7 +226,7 @@ def test_a_number_that_is_not_finite_is_refused_by_name(name: str) -> None:
         if "." not in option.key and {int, float} & {*union_members(option.annotation)}:
             for value in (math.nan, math.inf):
                 with pytest.raises(InputError, match=rf"^([\w, ]+, )?{option.key}(,[\w, ]+)?: expected"):
-                    typed(cls, {option.key: value} | more)
+                    from_dict(cls, {option.key: value} | more)
 
 
 HOSTILE = [

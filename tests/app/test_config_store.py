@@ -10,7 +10,7 @@ import pytest
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.compose import compose, open_hydra, plain_settings, run_many
+from gsencoder.app.compose import compose, open_hydra, plain_settings, run_sweep
 from gsencoder.app.main import COMMANDS
 from gsencoder.app.options import (
     EXPERIMENT,
@@ -301,7 +301,7 @@ def test_an_experiment_is_listed_once_and_exists_with_several_runs_too(tmp_path:
     with pytest.raises(InputError, match=r"^experiment: house is given twice in \[house,house\]"):
         composed("experiment=[house,house]")
     with pytest.raises(InputError, match="^experiment: expected one of house, .*got 'nope'"):
-        run_many("train", TrainCommandConfig, ["ROOMS", "experiment=house,nope", f"out={tmp_path}"], lambda config: "")
+        run_sweep("train", TrainCommandConfig, ["ROOMS", "experiment=house,nope", f"out={tmp_path}"], lambda config: "")
 
 
 def test_an_empty_list_of_scenes_to_hold_out_replaces_that_of_the_experiment() -> None:

@@ -7,7 +7,7 @@ import pytest
 from gsencoder.app.commands.encode import EncodeCommandConfig
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.compose import compose, typed
+from gsencoder.app.compose import compose, from_dict
 from gsencoder.app.main import COMMANDS
 from gsencoder.app.options import PRESETS, options_by_key, preset_values, settings
 from gsencoder.core.errors import InputError
@@ -73,7 +73,7 @@ def test_an_unknown_preset_is_an_error_that_lists_them(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="^preset: expected one of balanced, exact, fast, got 'quick'"):
         composed("preset=quick")
     with pytest.raises(InputError, match="^preset: expected one of fast, balanced, exact, got 'quick'"):
-        typed(FuseCommandConfig, {"preset": "quick"})
+        from_dict(FuseCommandConfig, {"preset": "quick"})
 
 
 def test_errors_of_budgets_are_held_against_the_exact_preset() -> None:

@@ -8,7 +8,7 @@ import pytest
 from tuning_pairs import png
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import sealed
+from gsencoder.core.files import with_checksum
 from gsencoder.data.prompts import PICTURES_FOLDER, PROMPTS_FILE, TOKENS_FOLDER, PromptStore
 
 
@@ -103,7 +103,8 @@ def test_folders_of_pictures_are_there_once_and_damaged_files_are_named(tmp_path
 )
 def test_names_that_leave_the_folder_are_no_prompt(tmp_path, changes):
     row = {"key": "a", "text": "t", "pictures": ["x.png"], "tokens": "", "space": ""}
-    (tmp_path / PROMPTS_FILE).write_text(json.dumps(sealed(row)) + "\n" + json.dumps(sealed(row | changes)) + "\n")
+    lines = [json.dumps(with_checksum(each)) for each in (row, row | changes)]
+    (tmp_path / PROMPTS_FILE).write_text("\n".join(lines) + "\n")
     with pytest.raises(InputError, match="line 2 is no prompt, or damaged"):
         PromptStore(tmp_path)
     (tmp_path / PROMPTS_FILE).write_text("[]\n")

@@ -7,7 +7,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.benchmarks.absent import (
-    AskedWord,
+    WordPresence,
     absent_scores,
     auroc,
     auroc_standard_error,
@@ -26,11 +26,11 @@ def thing(name: str | None, views: int = 9, max_pixels: int = 900, *, placed: bo
     )
 
 
-def asked(word: str, present: bool, probability: float) -> AskedWord:
-    return AskedWord(word=word, present=present, probability=probability, boxed=probability >= 0.5)
+def asked(word: str, present: bool, probability: float) -> WordPresence:
+    return WordPresence(word=word, present=present, probability=probability, boxed=probability >= 0.5)
 
 
-def scene_of(*rows: tuple[str, bool, float]) -> tuple[AskedWord, ...]:
+def scene_of(*rows: tuple[str, bool, float]) -> tuple[WordPresence, ...]:
     return tuple(asked(*row) for row in rows)
 
 

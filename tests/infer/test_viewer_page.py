@@ -27,7 +27,7 @@ from gsencoder.infer.page.page import (
     Bundle,
     Container,
     FileOptions,
-    MadePage,
+    PageFile,
     file_container,
     file_page,
     fitting_page,
@@ -440,13 +440,13 @@ def colored(scene: Scene, degree: int) -> Scene:
     return replace(scene, gaussians=replace(scene.gaussians, sh=sh.astype(np.float32)))
 
 
-def fitted(search: SceneSearch, limit: int, *degrees: int, options: FileOptions = OPTIONS, **further: int) -> MadePage:
+def fitted(search: SceneSearch, limit: int, *degrees: int, options: FileOptions = OPTIONS, **further: int) -> PageFile:
     scenes = [(colored(search.shown.scene, degree), f"t{degree}", search.words) for degree in degrees]
     limits = {"max_gaussians": 10**6, "max_bytes": limit} | further
     return fitting_page(STUB, scenes, LocalizeConfig(), ROOM.objects, options, **limits)
 
 
-def scenes_of(made: MadePage) -> list[Container]:
+def scenes_of(made: PageFile) -> list[Container]:
     matches = re.findall(r'id="scene-\d+">([^<]+)<', made.page.decode())
     return [read_container(gzip.decompress(base64.b64decode(blob))) for blob in matches]
 

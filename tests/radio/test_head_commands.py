@@ -10,7 +10,7 @@ from radio_world import QUICK, SEEDS, World, run
 from symbolic import symbolic_sizes
 
 from gsencoder.app import main as cli
-from gsencoder.app.scenes import queried_scene
+from gsencoder.app.scenes import load_query
 from gsencoder.core.archive import open_archive
 from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.measured_heads import find_head, head_outputs, load_heads
@@ -73,7 +73,7 @@ def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(wor
     outputs = head_outputs(head.head, features.decode()) - head.mean
     cosines = outputs @ vectors / (np.linalg.norm(outputs, axis=1) * np.linalg.norm(vectors))
     config = TransformersTextConfig(model=str(world.siglip))
-    head_scene, table = queried_scene(scene, fused, head="siglip", text=config)
+    head_scene, table = load_query(scene, fused, head="siglip", text=config)
     made = localize(
         head_scene,
         ["mug"],

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsencoder.app.options import FeaturesConfig, settings
 from gsencoder.app.run import Run
-from gsencoder.app.scenes import folder_of, load_words, queried_scene, shown_scene
+from gsencoder.app.scenes import folder_of, load_feature_scene, load_query, load_words
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed, printable
 from gsencoder.core.files import write_json
 from gsencoder.core.process import Clock
@@ -123,13 +123,13 @@ def run(config: AskCommandConfig, run: Run) -> None:
     if not questions:
         check_question(config.task, config.question)
     with run.step("load"):
-        asker = asker_of(config, config.vlm, shown_scene(folder, config.photos, config.data), folder)
+        asker = build_asker(config, config.vlm, load_feature_scene(folder, config.photos, config.data), folder)
     out = run.out(asker.scene.name, "answers" if questions else "answer")
     clock = Clock()
     if questions:
         with run.resumable(out, "answers", resume=config.resume) as (target, work):
             rows = ask_questions(
-                questions, asker, server, work, made_from=made_from(config), clock=clock, track=run.track
+                questions, asker, server, work, made_from=answer_settings(config), clock=clock, track=run.track
             )
             write_answers(target, work, rows)
             run.add_seconds(clock.seconds)
@@ -147,7 +147,7 @@ def run(config: AskCommandConfig, run: Run) -> None:
     )
 
 
-def made_from(config: AskCommandConfig) -> dict[str, Any]:
+def answer_settings(config: AskCommandConfig) -> dict[str, Any]:
     """Settings that answers depend on and the asker does not know."""
     values = settings(config)
     return {name: values[name] for name in ("space", "photos", "data")}
@@ -176,7 +176,7 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
         for path in folders:
             with run.step("load"):
                 photos = str(folder_of(config.photos, path.name)) if config.photos else ""
-                asker = asker_of(config, config.vlm, shown_scene(path, photos, config.data), path)
+                asker = build_asker(config, config.vlm, load_feature_scene(path, photos, config.data), path)
             name = asker.scene.name
             if name in counts:
                 raise InputError(f"{path}: holds features of scene {name}, and so does another folder; give one")
@@ -192,7 +192,7 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
                 asker,
                 server,
                 state,
-                made_from=made_from(config),
+                made_from=answer_settings(config),
                 unanswered=unanswered,
                 clock=clock,
                 track=run.track,
@@ -238,11 +238,11 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
     run.print(f"{out}: {counted(len(answered), kind)}, {last}")
 
 
-def asker_of(config: AskingConfig, vlm: VlmConfig, scene: Scene, folder: Path) -> Asker:
+def build_asker(config: AskingConfig, vlm: VlmConfig, scene: Scene, folder: Path) -> Asker:
     """The asker of a scene that was loaded from a folder of features. A box can be asked about without words."""
     words: Words | None
     if config.head:
-        scene, words = queried_scene(
+        scene, words = load_query(
             scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )
     else:

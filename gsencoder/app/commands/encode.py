@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.compose import typed
+from gsencoder.app.compose import from_dict
 from gsencoder.app.options import SharedScenesConfig, settings
 from gsencoder.app.run import Run
 from gsencoder.core.arrays import even_indices
@@ -141,8 +141,7 @@ def _warn_of_missing(encoder: Encoder, file: Path, heads: Path | None, spaces: t
 def _encode_into(
     folder: Path, scene: Scene, encoder: Encoder, config: EncodeCommandConfig, made_with: Mapping[str, str], run: Run
 ) -> tuple[list[FeatureSpace], list[str]]:
-    """Encodes a scene and writes its features and words, and what they were made with; returns the spaces that were
-    written, and a line for each limit."""
+    """Encodes a scene and writes its features and words; returns the spaces written, and a line for each limit."""
     assert scene.gaussians is not None
     unit, budget = unit_of(scene, encoder.voxel), config.budget
     teachers = requested_teachers(encoder, config.spaces)
@@ -238,7 +237,7 @@ def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Enc
     if not (training.get("teachers") or training.get("teacher")):
         raise InputError("basis_views: the weights do not say which teacher they were made with; leave it out")
     stored = {key: training[key] for key in ("teacher", "teachers", "text") if training.get(key)}
-    source = typed(SourceConfig, stored)
+    source = from_dict(SourceConfig, stored)
     teachers = source.teachers_by_name
     only = next(iter(teachers)) if len(teachers) == 1 else name
     teacher = build_teacher(teachers[only], scene, words_by_teacher(teachers, source.text).get(only))

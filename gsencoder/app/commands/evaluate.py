@@ -16,7 +16,7 @@ from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.heads import words_of_head
 from gsencoder.app.options import CommonConfig
 from gsencoder.app.run import Progress, Run
-from gsencoder.app.scenes import folder_of, memory_of, queried_scene
+from gsencoder.app.scenes import folder_of, load_query, memory_of
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.core.settings import option
@@ -163,7 +163,7 @@ def source_and_words(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     if config.weights or config.splat or config.teacher != LabelsConfig():
         raise InputError("features: a folder has its own Gaussians and words; leave out weights=, splat= and teacher=")
     folder = folder_of(config.features, scene_name(find_scenes(config.paths)[0]))
-    _, words = queried_scene(load_features(folder), folder, head=config.head, space=config.space, text=config.text)
+    _, words = load_query(load_features(folder), folder, head=config.head, space=config.space, text=config.text)
     return lambda scene: (next(iter(scene.features.values())), {}), words
 
 
@@ -171,7 +171,7 @@ def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     """Features of a teacher or an encoder, with the words of teacher= and text=, or where neither is given, those of
     the weights."""
     if not config.weights:
-        words = _given_words(config)
+        words = _words_of_teacher(config)
         return fusion_source(config.teacher, words, config.fusion), words
     retain_freed_memory()
     encoder = load_encoder(config.weights, config.encode.device)
@@ -179,13 +179,13 @@ def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     if table is not None and config.teacher == LabelsConfig() and config.text == TableTextConfig():
         words = words_of_table(table)
     else:
-        words = _given_words(config)
+        words = _words_of_teacher(config)
     space = config.space or space_of_words(encoder, words)
     words = with_training_names(words, find_table(encoder, space))
     return encoder_source(encoder, config.encode, space), words
 
 
-def _given_words(config: EvaluateConfig) -> Words:
+def _words_of_teacher(config: EvaluateConfig) -> Words:
     words = words_of(config.teacher, config.text)
     if words is None:
         raise InputError(
@@ -237,7 +237,7 @@ def scenes_of(config: EvaluateConfig, paths: Sequence[Path], *, quiet: bool) -> 
                 f"features: {folder} holds those of scene {stored.name}, and {scene.name} is evaluated; give a folder "
                 f"that has the features of each scene in a folder of its name"
             )
-        queried, _ = queried_scene(stored, folder, head=config.head, space=config.space, text=config.text)
+        queried, _ = load_query(stored, folder, head=config.head, space=config.space, text=config.text)
         assert queried.gaussians is not None
         means = (queried.gaussians.means + (stored.origin - scene.origin)).astype(np.float32)
         gaussians = replace(queried.gaussians, means=means)

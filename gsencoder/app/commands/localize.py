@@ -11,7 +11,7 @@ from PIL import Image
 
 from gsencoder.app.options import QueriesConfig
 from gsencoder.app.run import Run
-from gsencoder.app.scenes import memory_of, queried_scene, query_words, shown_scene
+from gsencoder.app.scenes import load_feature_scene, load_query, memory_of, query_words
 from gsencoder.core.errors import InputError, listed, one_line
 from gsencoder.core.files import write_json, write_picture
 from gsencoder.core.settings import option
@@ -61,8 +61,8 @@ def run(config: LocalizeCommandConfig, run: Run) -> None:
         # Drawing needs torch, which finding boxes does without; it takes as long to load as they take to find.
         import_ahead("gsencoder.infer.pictures")
     with run.step("load"):
-        scene, _ = with_up(shown_scene(folder, config.photos, config.data))
-        queried, table = queried_scene(
+        scene, _ = with_up(load_feature_scene(folder, config.photos, config.data))
+        queried, table = load_query(
             scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )
         cameras = requested_cameras(scene, config.pose, config.view) if config.pose or config.view else None

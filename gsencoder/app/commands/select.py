@@ -10,7 +10,7 @@ import numpy as np
 
 from gsencoder.app.options import QueriesConfig
 from gsencoder.app.run import Progress, Run
-from gsencoder.app.scenes import queried_scene, query_words
+from gsencoder.app.scenes import load_query, query_words
 from gsencoder.core.errors import InputError, counted, one_line
 from gsencoder.core.files import write_json
 from gsencoder.core.settings import option
@@ -72,7 +72,7 @@ def run(config: SelectCommandConfig, run: Run) -> None:
     words = query_words(config.query, config.queries)
     with run.step("load"):
         scene, _ = with_up(load_features(folder))
-        queried, table = queried_scene(
+        queried, table = load_query(
             scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )
     with run.step("select"):

@@ -13,10 +13,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.commands.ask import AskingConfig, asker_of
+from gsencoder.app.commands.ask import AskingConfig, build_asker
 from gsencoder.app.output import prepared_folder
 from gsencoder.app.run import Run
-from gsencoder.app.scenes import shown_scene
+from gsencoder.app.scenes import load_feature_scene
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, counted, error_prefix, listed
 from gsencoder.core.files import lock_folder, plain
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE, read_log
@@ -263,12 +263,12 @@ def _state(folder: Path) -> list[list[Any]]:
 
 def _asker(folder: Path, photos: str, config: TuneCommandConfig) -> tuple[Asker, GaussianFeatures | None]:
     """What asks about a scene, and the features that are rendered as tokens."""
-    scene = shown_scene(folder, photos, config.data)
+    scene = load_feature_scene(folder, photos, config.data)
     features = None
     if config.tokens:
         with error_prefix(f"tokens={config.tokens}"):
             features = select_features(scene, config.tokens)[1]
-    return asker_of(config, VlmConfig(image_side=config.image_side), scene, folder), features
+    return build_asker(config, VlmConfig(image_side=config.image_side), scene, folder), features
 
 
 def _store(

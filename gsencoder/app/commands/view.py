@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsencoder.app.options import FeaturesConfig
 from gsencoder.app.run import Run
-from gsencoder.app.scenes import queried_scene
+from gsencoder.app.scenes import load_query
 from gsencoder.core.errors import InputError, printable
 from gsencoder.core.files import write_bytes
 from gsencoder.core.settings import option
@@ -104,7 +104,7 @@ def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple
         if not features.space.text_encoder:
             # Features such as DINOv2's can be looked at.
             return replace(scene, features={features.space.name: features}), None
-    return queried_scene(scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text)
+    return load_query(scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text)
 
 
 def _serve(

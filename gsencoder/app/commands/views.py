@@ -6,7 +6,7 @@ from pathlib import Path
 from gsencoder.app.heads import features_for_heads, heads_of_folder
 from gsencoder.app.options import QueriesConfig
 from gsencoder.app.run import Run
-from gsencoder.app.scenes import queried_scene, query_words, shown_scene
+from gsencoder.app.scenes import load_feature_scene, load_query, query_words
 from gsencoder.core.archive import write_archive
 from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.errors import InputError
@@ -79,14 +79,14 @@ def run(config: ViewsCommandConfig, run: Run) -> None:
     """Localizes the words, chooses and renders views of them, and writes the pictures and their scores."""
     folder = Path(config.paths[0])
     with run.step("load"):
-        scene = shown_scene(folder, config.photos, config.data)
+        scene = load_feature_scene(folder, config.photos, config.data)
     boxes: tuple[Box, ...] = ()
     targets: tuple[Target, ...] = ()
     absent: dict[str, str] = {}
     if config.query or config.queries or config.choose.method == "greedy":
         with run.step("localize"):
             words = query_words(config.query, config.queries)
-            queried, table = queried_scene(
+            queried, table = load_query(
                 scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
             )
             localization = localize(queried, words, table, config.localize)

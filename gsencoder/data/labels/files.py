@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, Int, Int64
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, readable
-from gsencoder.core.files import atomic_file, check_written, open_foreign, read_foreign
+from gsencoder.core.files import atomic_file, open_foreign, read_foreign, warn_if_modified
 from gsencoder.data.readers.transforms_json import read_json
 
 SCENE_BYTES = 256 << 20
@@ -46,7 +46,7 @@ def check_file(path: Path, *, max_bytes: int = SCENE_BYTES) -> None:
         raise InputError(f"{path}: is an archive (of torch.save, perhaps), and no text; write text, JSON or .npz")
     if size > max_bytes:
         raise InputError(f"{path}: {size:,} bytes; at most {max_bytes:,} are read")
-    check_written(path)
+    warn_if_modified(path)
 
 
 def read_checked(path: Path, *, max_bytes: int = SCENE_BYTES) -> bytes:

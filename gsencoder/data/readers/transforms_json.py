@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError, listed
-from gsencoder.core.files import check_written, read_foreign_text
+from gsencoder.core.files import read_foreign_text, warn_if_modified
 from gsencoder.data.readers.images import picture_info, picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,
@@ -84,7 +84,7 @@ def read_json(path: Path, *, unique_keys: bool = False) -> Any:
             raise InputError(f"{path}: the key {repeated[:40]!r} is there twice; expected each once")
         return dict(pairs)
 
-    check_written(path)
+    warn_if_modified(path)
     try:
         return json.loads(read_foreign_text(path), object_pairs_hook=unique if unique_keys else None)
     except FileNotFoundError:

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files import atomic_file, check_written, open_foreign
+from gsencoder.core.files import atomic_file, open_foreign, warn_if_modified
 from gsencoder.data.splats.packed import GZIP_MAGIC, MAGIC, read_sog_folder, read_sog_zip, read_spz, write_spz
 from gsencoder.data.splats.ply import (
     is_compressed,
@@ -71,7 +71,7 @@ def load_splat(path: str | Path, *, origin: Float64[np.ndarray, "3"] | None = No
     Warns:
         SceneWarning: something was left out, or values look as if they were stored otherwise (see `odd_values`).
     """
-    check_written(path)
+    warn_if_modified(path)
     return gaussians_from_raw(read_raw(path), origin=origin, where=str(path))
 
 

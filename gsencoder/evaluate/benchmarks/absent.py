@@ -45,7 +45,7 @@ class AbsentProtocol(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AskedWord:
+class WordPresence:
     """One word asked in one scene: whether an object has this name, the probability by `localize`, and whether there is
     a box."""
 
@@ -55,7 +55,7 @@ class AskedWord:
     boxed: bool
 
 
-Asked = tuple[AskedWord, ...]
+Asked = tuple[WordPresence, ...]
 """The words asked in one scene."""
 
 
@@ -82,7 +82,9 @@ class AbsentBenchmark(Benchmark[Asked]):
             result = localize(asked_scene, names, self.evaluation.words, self.evaluation.localization)
         boxless = result.absent
         return tuple(
-            AskedWord(word=name, present=row < len(present), probability=float(probability), boxed=name not in boxless)
+            WordPresence(
+                word=name, present=row < len(present), probability=float(probability), boxed=name not in boxless
+            )
             for row, (name, probability) in enumerate(zip(names, result.probabilities, strict=True))
         )
 

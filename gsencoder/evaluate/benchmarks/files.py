@@ -46,7 +46,7 @@ class ScoreOptions:
         True, "of answers and captions: use Java's tokenizer and METEOR where they are there; without, columns say so"
     )
 
-    def given_classes(self) -> str:
+    def required_classes(self) -> str:
         """The classes, which must be given."""
         if not self.classes:
             raise InputError("classes= is missing: scannet20, scannet200, or a CSV file with the columns id and name")
@@ -54,7 +54,7 @@ class ScoreOptions:
 
     def raw_ids(self) -> dict[str, int] | None:
         """Class id of each raw name of ScanNet's or ScanNet++'s objects, where labels are those of scans."""
-        return ids_of_raw_names(self.label_map, self.given_classes()) if self.label_map else None
+        return ids_of_raw_names(self.label_map, self.required_classes()) if self.label_map else None
 
     def split(self) -> tuple[str, ...] | None:
         """Names of the scenes to score; None = all of the labels."""

@@ -198,7 +198,7 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
     return score_instances(
         predictions,
         labels,
-        load_classes(options.given_classes(), instances=True),
+        load_classes(options.required_classes(), instances=True),
         method=options.method,
         scenes=options.split(),
         raw_ids=options.raw_ids(),
@@ -380,14 +380,7 @@ def _outcomes(
     scores: Float64[np.ndarray, " M"],
     counts: Bool[np.ndarray, " M"],
 ) -> tuple[Int64[np.ndarray, " K"], Bool[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
-    """The outcomes at one threshold: a prediction of the class of each, whether it is a match, and its score.
-
-    Args:
-        predictions, instances: pairs of one class that have vertices in common.
-        above: whether the IoU of a pair is above the threshold.
-        scored: whether the instance of a pair counts.
-        counts: whether a prediction that is above it with no instance is a false positive.
-    """
+    """The outcomes of one class at one threshold: the prediction of each, whether it is a match, and its score."""
     candidates = np.flatnonzero(above & scored)
     candidates = candidates[np.lexsort((predictions[candidates], instances[candidates]))]
     used_predictions: set[int] = set()

@@ -134,7 +134,7 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
     return score_semantics(
         predictions,
         labels,
-        load_classes(options.given_classes()),
+        load_classes(options.required_classes()),
         method=options.method,
         scenes=options.split(),
         raw_ids=options.raw_ids(),

@@ -123,7 +123,7 @@ def sweep_stage(
     (base,) = (row for row in rows if not row[0].knobs)
     phase: Phase = "grid" if sweep.grid else "one at a time"
     results = [summarize(row, base, phase if row[0].knobs else "base") for row in rows]
-    matter = tuple(knobs_that_matter(stage.knobs, rows, base, stage.cost))
+    matter = tuple(effective_knobs(stage.knobs, rows, base, stage.cost))
     rungs: list[Rung] = []
     if halving.settings and matter:
         values = {name: candidates for name, candidates in values_of(stage, sweep).items() if name in matter}
@@ -165,7 +165,7 @@ def _is_accepted(stage: Stage, knobs: Knobs) -> bool:
 def check_sweep(stages: Sequence[Stage], sweep: SweepConfig) -> None:
     """Complains about a sweep before hours of work."""
     knob_names = [knob.name for stage in stages for knob in stage.knobs]
-    names = [_given(text)[0] for text in sweep.values]
+    names = [_parse_values(text)[0] for text in sweep.values]
     if (repeated := first_repeated(names)) is not None:
         raise InputError(f"sweep.values: {repeated[0]} is given twice; give all of its values at once")
     for name_of_option, names_of_option in (("knobs", sweep.knobs), ("values", names)):
@@ -201,7 +201,7 @@ def settings_of(stage: Stage, sweep: SweepConfig) -> list[Knobs]:
 
 def values_of(stage: Stage, sweep: SweepConfig) -> dict[str, tuple[Any, ...]]:
     """The values of each knob that is tried, the base's first."""
-    given = dict(_given(text) for text in sweep.values)
+    given = dict(_parse_values(text) for text in sweep.values)
     by_name: dict[str, tuple[Any, ...]] = {}
     for knob in stage.knobs:
         if sweep.knobs and knob.name not in sweep.knobs:
@@ -213,7 +213,7 @@ def values_of(stage: Stage, sweep: SweepConfig) -> dict[str, tuple[Any, ...]]:
     return by_name
 
 
-def _given(text: str) -> tuple[str, list[str]]:
+def _parse_values(text: str) -> tuple[str, list[str]]:
     name, colon, text_of_values = text.partition(":")
     values = [value for value in text_of_values.split("/") if value]
     if not colon or not values:
@@ -409,7 +409,7 @@ NOISE_ERRORS = 2.0
 """An effect is noise if it is not larger than this number of standard errors."""
 
 
-def knobs_that_matter(
+def effective_knobs(
     knobs: Sequence[Knob], rows: Sequence[Sequence[Record]], base: Sequence[Record], cost: str
 ) -> list[str]:
     """Knobs of which a value, changed alone or beside what it needs, moves cost or a score by more than noise."""
@@ -426,8 +426,7 @@ def knobs_that_matter(
 
 
 def _effects(row: Sequence[Record], base: Sequence[Record], cost: str) -> Iterator[tuple[np.ndarray, float]]:
-    """Logarithms of costs over rounds and scenes, then differences of each score over scenes, each with the least that
-    counts."""
+    """Logarithms of costs, then differences of each score over scenes, each with the least that counts."""
     yield np.concatenate([_log_ratios(a, b, cost) for a, b in zip(row, base, strict=True)]), LEAST_EFFECT
     for name in HIGHER_IS_BETTER:
         pairs = [

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning, WriteError, error_prefix
-from gsencoder.core.files import plain, sealed, unsealed, write_bytes, write_json
+from gsencoder.core.files import plain, with_checksum, without_checksum, write_bytes, write_json
 from gsencoder.core.process import Clock, Track, untracked
 from gsencoder.data.labels.expressions import wrapped_caption
 from gsencoder.data.labels.files import box_corners
@@ -103,7 +103,7 @@ def ask_questions(
     done = _answered(work, digests)
     failures: dict[str, str] = {}
     # Rows of other settings, and one that was cut off, are removed before new ones are appended.
-    write_bytes(file, b"".join(_line(sealed(row)) for row in done.values()))
+    write_bytes(file, b"".join(_line(with_checksum(row)) for row in done.values()))
     for each in track(questions, "asking"):
         if each.id in done:
             continue
@@ -123,7 +123,7 @@ def ask_questions(
         row = {"id": each.id, "digest": digests[each.id], "warnings": messages, **row}
         try:
             with file.open("ab") as stream:
-                stream.write(_line(sealed(row)))
+                stream.write(_line(with_checksum(row)))
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
@@ -155,7 +155,7 @@ def _answered(work: Path, digests: Mapping[str, str]) -> dict[str, dict[str, Any
     rows = {}
     for name, row in read_answers(work / ANSWERS).items():
         try:
-            rows[name] = unsealed(row)
+            rows[name] = without_checksum(row)
         except (ValueError, RecursionError) as error:
             message = f"{work / ANSWERS}: the answer to {name[:40]} is not as it was written"
             raise InputError(f"{message}; give resume=false to ask again") from error

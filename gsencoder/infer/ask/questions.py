@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, counted, error_prefix, listed, readable
-from gsencoder.core.files import MODEL_BYTES, check_written, open_foreign, read_foreign
+from gsencoder.core.files import MODEL_BYTES, open_foreign, read_foreign, warn_if_modified
 from gsencoder.data.labels.expressions import Expression, read_scanrefer
 from gsencoder.data.labels.files import (
     Corner,
@@ -105,7 +105,7 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
     """The finished lines of a file of answers, by id; a last line that was cut off is none."""
     if not path.exists():
         return {}
-    check_written(path)
+    warn_if_modified(path)
     with readable(path):
         lines = read_foreign(path, MODEL_BYTES).split(b"\n")
     rows = {}

@@ -269,7 +269,7 @@ THINNING = 0.9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MadePage:
+class PageFile:
     """A page, what it says of each of its scenes (see `file_container`), and what was left out, a sentence each."""
 
     page: bytes
@@ -286,7 +286,7 @@ def fitting_page(
     *,
     max_gaussians: int,
     max_bytes: int,
-) -> MadePage:
+) -> PageFile:
     """The page with as much as fits: spherical harmonics are left out degree by degree, then Gaussians.
 
     Args:
@@ -337,4 +337,4 @@ def fitting_page(
                 + (", or photographs=0" if any(each.meta["photographViews"] for each in containers) else "")
             )
     metas = tuple(each.meta for each in containers)
-    return MadePage(page=page, metas=metas, notes=(*notes, *(note for meta in metas for note in meta["notes"])))
+    return PageFile(page=page, metas=metas, notes=(*notes, *(note for meta in metas for note in meta["notes"])))

@@ -28,7 +28,7 @@ GREY = 90
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ShownScene:
+class DisplayScene:
     """A scene with one feature set, as it is drawn, of `total` Gaussians; the notes say what was left out."""
 
     scene: Scene
@@ -46,7 +46,7 @@ class ShownScene:
         return next(iter(self.scene.features.values()))
 
 
-def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "") -> ShownScene:
+def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "") -> DisplayScene:
     """A scene with at most `max_gaussians`, evenly chosen and enlarged so that surfaces stay closed; a note about that
     ends with `advice`."""
     gaussians, features = select_features(scene, None)
@@ -71,7 +71,7 @@ def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "
     if unseen:
         notes.append(f"{unseen:,} Gaussians were seen by no view and have no features; they are grey.")
     chosen = replace(scene, gaussians=gaussians, features={features.space.name: features})
-    return ShownScene(scene=chosen, title=title, total=total, notes=tuple(notes))
+    return DisplayScene(scene=chosen, title=title, total=total, notes=tuple(notes))
 
 
 def spz_bytes(gaussians: Gaussians, *, sh_degree: int = 3) -> bytes:
@@ -170,7 +170,7 @@ class SceneSearch:
         config: how words become boxes; the cosines are centered.
     """
 
-    shown: ShownScene
+    shown: DisplayScene
     words: Words | None
     config: LocalizeConfig
     products: GaussianProducts = field(init=False)

@@ -168,14 +168,14 @@ class _Handler(BaseHTTPRequestHandler):
             case [""]:
                 return server.page[0], "text/html; charset=utf-8"
             case ["scene", number]:
-                server.search_of(_whole(number))
-                return server.scene_bytes[_whole(number)], BINARY
+                server.search_of(_parse_index(number))
+                return server.scene_bytes[_parse_index(number)], BINARY
             case ["labels", number]:
-                labels = server.search_of(_whole(number)).labels
+                labels = server.search_of(_parse_index(number)).labels
                 return Container(meta={"names": labels.names}, arrays={"numbers": labels.numbers}).to_bytes(), BINARY
             case ["photograph", number, view]:
-                views = server.search_of(_whole(number)).shown.scene.views
-                return jpeg_of(views, _whole(view), PHOTOGRAPH_SIDE), "image/jpeg"
+                views = server.search_of(_parse_index(number)).shown.scene.views
+                return jpeg_of(views, _parse_index(view), PHOTOGRAPH_SIDE), "image/jpeg"
         raise RefusedError(HTTPStatus.NOT_FOUND, "there is nothing at this address")
 
     def _other(self, _: list[str]) -> tuple[bytes, str]:
@@ -229,7 +229,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Requests are not logged: their addresses hold the token."""
 
 
-def _whole(text: str) -> int:
+def _parse_index(text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 9):
         raise RefusedError(HTTPStatus.NOT_FOUND, "there is nothing at this address")
     return int(text)

@@ -26,7 +26,7 @@ from gsencoder.core.budget import (
 )
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import picture_bytes
-from gsencoder.core.settings import option, shown_value
+from gsencoder.core.settings import format_value, option
 from gsencoder.infer.draw import Picture
 from gsencoder.infer.views.candidates import FreeSpace
 from gsencoder.infer.views.choose import (
@@ -265,8 +265,7 @@ def _unseen(most: Float64[np.ndarray, " n"], chosen: Float64[np.ndarray, " n"]) 
 
 
 def _window_around(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> tuple[int, ...] | None:
-    """Left, upper, right and lower edge of the part of a picture that Gaussians may reach into, pixels, the last two
-    exclusive; None where they reach into none."""
+    """Left, upper, right and lower edge of what Gaussians may reach into, pixels, the last two exclusive; or None."""
     means = gaussians.means.astype(np.float64)
     pixels, depths = cameras.project(means, view, min_depth=near)
     reach = CONSTANTS.window_sigmas * gaussians.scales.max(axis=1).astype(np.float64)
@@ -313,7 +312,7 @@ def pictures_within(
             count = int((total <= limit).sum())
             note = (
                 f"{budget.option('megabytes')}: {count} of {counted(len(views), 'view')} fit in pictures of {least} "
-                f"pixels, the least; all take {shown_value(math.ceil(1e4 * total[-1]) / 1e4)} MB"
+                f"pixels, the least; all take {format_value(math.ceil(1e4 * total[-1]) / 1e4)} MB"
             )
         return _selected(smallest, np.arange(count)), pictures[:count], float(total[count - 1]), (note,)
     sample = np.argsort(-_pixels(views) / _pixels(smallest), kind="stable")[:SAMPLED]

@@ -351,8 +351,7 @@ def shell_cameras(
 def _background_fraction(
     target: Target, centers: Float64[np.ndarray, "n 3"], vertical: Float64[np.ndarray, "3"], free: FreeSpace
 ) -> Float64[np.ndarray, " n"]:
-    """Share of the rays through a target, and beside it, that end at something, for each camera. They begin before the
-    target, so that what it hangs on or lies on counts from either side."""
+    """Share of the rays through a target, and next to it, that end at something, for each camera."""
     forward = target.center - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right, down, _ = np.moveaxis(look_rotation(forward, vertical), 1, 0)
@@ -364,6 +363,7 @@ def _background_fraction(
             through = target.center + beside * (across * right + along * down)
             ray = through - centers
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+            # They begin before the target, so that what it hangs on or lies on counts from either side.
             hits += np.isfinite(free.first_hit(through - beside * ray, ray, length))
     return hits / 9
 

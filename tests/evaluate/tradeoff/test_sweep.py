@@ -27,8 +27,8 @@ from gsencoder.evaluate.tradeoff.sweep import (
     check_sweep,
     crowding,
     draw_settings,
+    effective_knobs,
     estimate,
-    knobs_that_matter,
     mark_front,
     non_dominated_ranks,
     scene_row,
@@ -263,8 +263,8 @@ def test_the_cost_of_the_stage_is_the_one_that_decides() -> None:
     for knobs, seconds in (({}, 2.0), ({"effort": 1}, 1.0)):
         timing = Timing(seconds=seconds, cpu_seconds=4.0, mib=1.0)
         rows.append([Record(stage="fusion", scene="a", knobs=knobs, timings=(timing,))])
-    assert knobs_that_matter([effort], rows, rows[0], "seconds") == ["effort"]
-    assert knobs_that_matter([effort], rows, rows[0], "cpu_seconds") == []
+    assert effective_knobs([effort], rows, rows[0], "seconds") == ["effort"]
+    assert effective_knobs([effort], rows, rows[0], "cpu_seconds") == []
 
 
 def test_what_scenes_do_not_agree_on_is_noise_and_a_scene_without_things_says_nothing() -> None:
@@ -275,8 +275,8 @@ def test_what_scenes_do_not_agree_on_is_noise_and_a_scene_without_things_says_no
         return [*scenes, record("d", [1.0], {"acc_25": Score(0, 0)}, **knobs)]
 
     base = row(4, 4, 4)
-    assert knobs_that_matter([effort], [base, row(7, 2, 4, effort=1)], base, "bytes") == []
-    assert knobs_that_matter([effort], [base, row(6, 5, 6, effort=1)], base, "bytes") == ["effort"]
+    assert effective_knobs([effort], [base, row(7, 2, 4, effort=1)], base, "bytes") == []
+    assert effective_knobs([effort], [base, row(6, 5, 6, effort=1)], base, "bytes") == ["effort"]
 
 
 points = st.integers(1, 12).flatmap(
