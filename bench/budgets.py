@@ -20,12 +20,12 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.fusion.basis import field_error, judge
 from gsencoder.fusion.budget import BudgetFusion, FusionBudget, exact_config, fuse_within
 from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher
-from gsencoder.fusion.errors import field_error, judge
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.teachers.base import Teacher
-from gsencoder.teachers.build import TeacherConfig, build_teacher, words_of
+from gsencoder.teachers.build import TeacherConfig, words_of
 from gsencoder.teachers.labels import LabelsConfig, PaletteConfig
 from gsencoder.teachers.onnx import OnnxConfig
 from gsencoder.types import FeatureMap, Scene, Views
@@ -61,7 +61,7 @@ def teacher_config(name: str, skip_tokens: int) -> TeacherConfig:
 def opened(path: Path, config: TeacherConfig) -> tuple[Scene, Teacher]:
     """A scene with Gaussians, and its teacher."""
     scene = with_gaussians(load_scene(path, options=SceneConfig()), SeedConfig())
-    return scene, build_teacher(config, scene, words_of(config))
+    return scene, config.build(scene, words_of(config))
 
 
 def measured(scene: Scene, teacher: Teacher, error: float, maps: Path) -> tuple[dict[str, Any], BudgetFusion, Any]:

@@ -20,7 +20,7 @@ from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.fusion.errors import field_error, judge
+from gsencoder.fusion.basis import field_error, judge
 from gsencoder.infer.encode import EncodeConfig, load_encoder
 from gsencoder.infer.encode_budget import EncodeBudget, encode_within
 

@@ -29,9 +29,9 @@ from gsencoder.core.process import retain_freed_memory
 from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
-from gsencoder.models.neighbors import _append_zero_row, _gather_neighborhoods, _row_blocks
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.plan import plan_cloud
+from gsencoder.models.transformer import _append_zero_row, _gather_neighborhoods, _row_blocks
 from gsencoder.types import FeatureSpace, Gaussians
 
 CHANNELS = 64

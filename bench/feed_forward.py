@@ -28,7 +28,7 @@ from gsencoder.infer.encode import load_encoder
 from gsencoder.memory.bank import MapStream, build_bank, principal_queries
 from gsencoder.memory.index import index_features
 from gsencoder.teachers.base import Teacher
-from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.train.memory import MemoryConfig, memory_training, prepare_memory, train_memory
 from gsencoder.types import FeatureMap, QueryMemory, Scene
@@ -59,11 +59,11 @@ def main() -> None:
     words = words_of(labels)
     teacher_name = next(name for name, space in encoder.spaces.items() if space.teacher == "labels")
     others = [load_scene(path) for path in arguments.bank_rooms]
-    shared_maps = maps_of([(scene, build_teacher(labels, scene, words)) for scene in others])
+    shared_maps = maps_of([(scene, labels.build(scene, words)) for scene in others])
     results, seconds = defaultdict(list), defaultdict(list)
     for path in arguments.rooms:
         scene = with_gaussians(load_scene(path), SeedConfig())
-        teacher = build_teacher(labels, scene, words)
+        teacher = labels.build(scene, words)
         assert isinstance(teacher, LabelsTeacher)
         truth = fuse(scene, teacher).features
         start = time.perf_counter()

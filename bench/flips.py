@@ -20,10 +20,10 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.folder import FEATURES_FILE, WORDS_FILE, load_features
+from gsencoder.fusion.folder import FEATURES_FILE, load_features
+from gsencoder.models.encoder import load_weights
 from gsencoder.models.output_space import WEIGHTS_FILE
-from gsencoder.models.weights import load_weights
-from gsencoder.text.table import load_text_table
+from gsencoder.text.table import WORDS_FILE, load_text_table
 
 
 def digest(value: Any) -> str:

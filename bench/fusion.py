@@ -18,7 +18,7 @@ from json_option import add_json_option, write_figures
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.fuse import fuse
-from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig
 
@@ -30,7 +30,7 @@ def main() -> None:
     add_json_option(parser)
     options = parser.parse_args()
     scene = with_gaussians(load_scene(options.scene), SeedConfig())
-    teacher = build_teacher(LabelsConfig(), scene, words_of(LabelsConfig(), TableTextConfig()))
+    teacher = LabelsConfig().build(scene, words_of(LabelsConfig(), TableTextConfig()))
     print(f"{len(scene.gaussians):,} Gaussians, {len(scene.views)} views")
     runs = []
     for _ in range(options.runs):

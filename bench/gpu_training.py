@@ -20,7 +20,7 @@ from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 from gsencoder.core.process import Precision
 from gsencoder.models.transformer import DropPath
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared import PreparedDataset
 from gsencoder.train.run import encoder_trainer
 
 STEPS = 3

@@ -32,7 +32,7 @@ from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.infer.encode import load_encoder
 from gsencoder.render import blend
-from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.build import words_of
 from gsencoder.types import FeatureMap, GaussianFeatures, Gaussians, Scene
 from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
@@ -110,7 +110,7 @@ def score(arguments: argparse.Namespace) -> None:
     config = compose("fuse", FuseCommandConfig, ["-", f"teacher={arguments.teacher}"])
     kept = load_scene(arguments.out / "kept", splat=SPLAT)
     left_out = load_scene(arguments.out / "left_out")
-    teacher = build_teacher(config.teacher, kept, words_of(config.teacher, config.text))
+    teacher = config.teacher.build(kept, words_of(config.teacher, config.text))
     maps = [teacher.feature_map(left_out.views, view) for view in range(len(left_out.views))]
     fused = fuse(kept, teacher, FuseConfig()).features
     print("| features | rank | raw cosine | centered cosine | cells covered |")

@@ -35,11 +35,10 @@ from json_option import add_json_option, write_figures
 from gsencoder.core.process import memory_growth
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.fusion.basis import Moments, fit_basis, to_coordinates
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import Moments, field_error, fit_basis, to_coordinates
 from gsencoder.fusion.lift import VisibilityConfig, center_matrix, ray_pixels
 from gsencoder.render import Blend, BlendConfig, blend
-from gsencoder.render.rays import grid_lattice
+from gsencoder.render.blend_cpu import grid_lattice
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Views
 
 RAYS = 16

@@ -27,7 +27,7 @@ from gsencoder.evaluate.sources import RenderedTally
 from gsencoder.memory.attention import make_decoder
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import Blend, blend
-from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.build import words_of
 from gsencoder.train.loop import Trainer
 from gsencoder.train.memory import (
     MemoryConfig,
@@ -64,7 +64,7 @@ def open_case(folder: Path, teacher_words: str, work: Path, bank: BankConfig) ->
     config = compose("fuse", FuseCommandConfig, ["-", *f"teacher={teacher_words}".split()])
     name = teacher_words.split()[0]
     kept, left_out = load_scene(folder / "kept", splat=SPLAT), load_scene(folder / "left_out")
-    teacher = build_teacher(config.teacher, kept, words_of(config.teacher, config.text))
+    teacher = config.teacher.build(kept, words_of(config.teacher, config.text))
     start = time.perf_counter()
     tag = f"{name}_{bank.method}_{bank.threshold or bank.cosine}"
     scene = prepare_memory(kept, teacher, work / tag, bank)

@@ -27,7 +27,6 @@ from gsencoder.data.seeding.seed import seed
 from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.localize import LocalizeConfig, localize
-from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
 from gsencoder.types import SceneObject
@@ -61,7 +60,7 @@ def main() -> None:
     for path in find_scenes([Path(options.scenes)])[options.first : last : options.every]:
         scene = load_scene(path)
         scene = replace(scene, gaussians=seed(scene))
-        features = fuse(scene, build_teacher(LabelsConfig(), scene, words)).features
+        features = fuse(scene, LabelsConfig().build(scene, words)).features
         scene = replace(scene, features={features.space.name: features})
         kinds = sorted({o.name for o in scene.objects if o.name is not None})
         result = localize(scene, [*names, *kinds], words, LocalizeConfig(min_probability=0.0))

@@ -15,7 +15,7 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.fusion.errors import row_cosines
+from gsencoder.fusion.basis import row_cosines
 from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.types import GaussianFeatures
 

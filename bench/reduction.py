@@ -21,7 +21,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.checkpoint import CachedTeacher
 from gsencoder.memory.reduction import CoverReduction, reduce_as_published, unit_rows
-from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.build import words_of
 
 CHUNK = 5000
 
@@ -30,7 +30,7 @@ def raw_features(scene_path: Path, teacher_words: list[str], maps: Path | None) 
     """The vectors of all cells of all views, in order."""
     config = compose("fuse", FuseCommandConfig, ["-", *teacher_words])
     scene = load_scene(scene_path)
-    teacher = build_teacher(config.teacher, scene, words_of(config.teacher, config.text))
+    teacher = config.teacher.build(scene, words_of(config.teacher, config.text))
     views = scene.views
     source = teacher if maps is None else CachedTeacher(teacher, maps)
     if maps is not None:

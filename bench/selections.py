@@ -50,7 +50,7 @@ from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.select import select
 from gsencoder.render import Blend, blend
 from gsencoder.render.images import render_image
-from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, SceneObject, Views
@@ -165,7 +165,7 @@ def count_boxes(rooms: Sequence[Path], splats: Path | None) -> dict[str, dict[st
     seconds: dict[str, float] = defaultdict(float)
     for path in rooms:
         scene = with_gaussians(load_scene(path, splat=splats / path.name / "splat.ply" if splats else None))
-        features = fuse(scene, build_teacher(LabelsConfig(), scene, words)).features
+        features = fuse(scene, LabelsConfig().build(scene, words)).features
         scene = replace(scene, features={features.space.name: features})
         targets = [each for each in scene.objects if each.name and is_seen(each, min_views=5, min_pixels=60)]
         names = sorted({target.name for target in targets if target.name})
@@ -233,7 +233,7 @@ def main() -> None:
             totals["other views"]["weighted"].append(weighted)
         unit = unit_of(scene, encoder.voxel)
         sources = {
-            "fused": fuse(scene, build_teacher(LabelsConfig(), scene, words)).features,
+            "fused": fuse(scene, LabelsConfig().build(scene, words)).features,
             "encoded": encoder.encode(scene.gaussians, metres_per_unit=unit),
         }
         for name, features in sources.items():

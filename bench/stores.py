@@ -26,14 +26,14 @@ from gsencoder.app.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.benchmarks.localization import Hit, LocalizationProtocol, score_queries, scores
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, load_features, save_features, save_memories
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.package import PACKAGE_FILE, save_index_package, save_package
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.memory.bank import BankConfig
 from gsencoder.memory.index import IndexConfig, index_features
-from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.build import words_of
 from gsencoder.train.memory import MemoryConfig, memory_training, prepare_memory, train_memory, untrained_memory
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -85,7 +85,7 @@ def only(folder: Path) -> GaussianFeatures:
 def memories(scene: Scene, words: list[str], work: Path, *, optimize: bool) -> Iterator[Stored]:
     """Memories of the scene."""
     config = compose("fuse", FuseCommandConfig, ["-", *words])
-    teacher = build_teacher(config.teacher, scene, words_of(config.teacher, config.text))
+    teacher = config.teacher.build(scene, words_of(config.teacher, config.text))
     prepared = prepare_memory(scene, teacher, work / "prepared", BankConfig())
     for channels in (4, 8, 16, 32):
         setting = MemoryConfig(channels=channels)
@@ -117,7 +117,7 @@ def main() -> None:
     rows: dict[tuple[str, str], Row] = defaultdict(Row)
     for path in arguments.scenes:
         scene = with_gaussians(load_scene(path, splat=arguments.splat or None))
-        fused = fuse(scene, build_teacher(config.teacher, scene, words), FuseConfig()).features
+        fused = fuse(scene, config.teacher.build(scene, words), FuseConfig()).features
         with tempfile.TemporaryDirectory() as folder:
             work = Path(folder)
             makers = [

@@ -28,7 +28,6 @@ from gsencoder.infer.views.candidates import FreeSpace
 from gsencoder.infer.views.choose import choose_views, score_views
 from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, targets_of
 from gsencoder.render import BlendConfig
-from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.table import load_text_table
 from gsencoder.types import Scene, SceneObject
@@ -54,7 +53,7 @@ def objects_of(path: str, large: bool) -> tuple[Scene, list[tuple[Target, SceneO
     """A scene with Gaussians, and what was found of its objects beside the labels."""
     words = load_text_table(find_file(WORDS, "words"))
     scene = with_gaussians(load_scene(path))
-    features = fuse(scene, build_teacher(LabelsConfig(words=WORDS), scene, words)).features
+    features = fuse(scene, LabelsConfig(words=WORDS).build(scene, words)).features
     scene = replace(scene, features={features.space.name: features})
     asked = furniture(scene.objects) if large else queryable_objects(scene.objects)
     with warnings.catch_warnings():

@@ -23,7 +23,7 @@ from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.relevancy import ThresholdConfig
-from gsencoder.teachers.build import build_teacher, text_table_of
+from gsencoder.teachers.build import text_table_of
 from gsencoder.teachers.labels import LabelsConfig
 
 VISIBILITIES = {
@@ -64,7 +64,7 @@ def main() -> None:
         for voxel in map(float, options.voxels.split(",")):
             scene = load_scene(path)
             scene = dataclasses.replace(scene, gaussians=seed(scene, SeedConfig(voxel=voxel)))
-            labels = build_teacher(teacher, scene, words)
+            labels = teacher.build(scene, words)
             for lift in options.lifts.split(","):
                 for name, visibility in tests.items():
                     config = FuseConfig(lift=lift, visibility=visibility)  # type: ignore[arg-type]

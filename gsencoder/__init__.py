@@ -28,7 +28,7 @@ _HOME = {
     "save_features": "gsencoder.fusion.folder",
     "Encoder": "gsencoder.infer.encode",
     "load_encoder": "gsencoder.infer.encode",
-    "load_weights": "gsencoder.models.weights",
+    "load_weights": "gsencoder.models.encoder",
     "localize": "gsencoder.infer.localize",
     "targets_of": "gsencoder.infer.views.targets",
     "choose_views": "gsencoder.infer.views.choose",

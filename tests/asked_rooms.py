@@ -7,8 +7,8 @@ import numpy as np
 from rooms import STEP, cube, room
 
 from gsencoder.app import main as cli
-from gsencoder.fusion.folder import WORDS_FILE, save_features
-from gsencoder.text.table import make_text_table, save_text_table
+from gsencoder.fusion.folder import save_features
+from gsencoder.text.table import WORDS_FILE, make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures
 
 NAMES = ("cube", "crate", "wall", "pen holder")

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from training_scenes import SMALL, DenseSideTeacher, SideTeacher, prepared, samples
 
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.samples import Batch, SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene, join_samples
+from gsencoder.train.losses import Batch, TeacherRecipe
+from gsencoder.train.prepared import PreparedDataset
+from gsencoder.train.samples import SampleDataset, SampleRecipe, TrainingScene, join_samples
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 TALL = FeatureSpace(name="heights", channels=4)

@@ -12,7 +12,6 @@ from scene_files import save
 from splats import front_camera, random_gaussians
 
 from gsencoder.teachers.base import Teacher
-from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.regions import OnnxRegionOptions, RegionsConfig
 from gsencoder.text.table import TextTable, make_text_table, unit
 from gsencoder.types import Cameras, FeatureMap, Scene, SceneObject, Views
@@ -93,7 +92,7 @@ def captioned_teacher(
 ) -> Teacher:
     if captions is not None:
         (masks / "captions.json").write_text(json.dumps(captions))
-    return build_teacher(RegionsConfig(folder=str(masks), **options), scene, words)
+    return RegionsConfig(folder=str(masks), **options).build(scene, words)
 
 
 PLAIN = {"scale": 1.0, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
@@ -104,7 +103,7 @@ VISION = {**SMALL, "image_size": 8, "patch_size": 4}
 def build(masks: Path, model: Path, vector: str, words: TextTable | None = None, **options: Any) -> Teacher:
     plain = OnnxRegionOptions(layout="grid", patch=4, size=WIDTH, **PLAIN)
     config = RegionsConfig(folder=str(masks), vector=vector, model=str(model), **{"onnx": plain, **options})  # type: ignore[arg-type]
-    return build_teacher(config, region_scene(), words)
+    return config.build(region_scene(), words)
 
 
 def made(teacher: Teacher, view: int) -> FeatureMap:

@@ -48,12 +48,12 @@ from gsencoder.fusion.folder import (
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_package
 from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers
+from gsencoder.models.encoder import load_weights, save_weights
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
-from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.reconstruct.parameters import RowAdam, State, anchor_at, load_state, parameters_from, save_state
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE
+from gsencoder.train.prepared import CLASS_BALANCE_FILE, SPACE_FILE
 from gsencoder.types import FeatureSpace, Scene, Views
 
 FLIPS = 30

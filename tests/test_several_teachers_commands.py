@@ -12,7 +12,7 @@ from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.encode import Encoder
-from gsencoder.models.weights import load_weights
+from gsencoder.models.encoder import load_weights
 
 pytestmark = pytest.mark.slow
 

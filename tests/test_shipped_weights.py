@@ -14,13 +14,12 @@ from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.evaluate.benchmarks.naming import NamingProtocol, naming_scores
 from gsencoder.evaluate.benchmarks.protocol import Evaluation
-from gsencoder.fusion.errors import field_error
-from gsencoder.fusion.folder import load_tables
+from gsencoder.fusion.basis import field_error
 from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.localize import localize
+from gsencoder.models.encoder import load_weights
 from gsencoder.models.output_space import SHIPPED_WEIGHTS
-from gsencoder.models.weights import load_weights
-from gsencoder.text.table import TextTable
+from gsencoder.text.table import TextTable, load_tables
 from gsencoder.text.vocabulary import words_of_table
 from gsencoder.train.loop import CHANGEABLE_ON_RESUME
 from gsencoder.train.samples import Augmentation

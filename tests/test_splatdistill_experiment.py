@@ -14,8 +14,8 @@ from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.infer.encode import Encoder
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.infer.torch_network import TorchNetwork
+from gsencoder.models.encoder import load_weights
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.weights import load_weights
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.run import TrainConfig
 

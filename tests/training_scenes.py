@@ -15,18 +15,11 @@ from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.transformer import TransformerConfig
 from gsencoder.teachers.base import Teacher
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, Trainer, TrainerConfig
-from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepare import PrepareConfig, PreparedDataset
+from gsencoder.train.losses import LossConfig, TeacherRecipe
+from gsencoder.train.prepare import PrepareConfig, add_scene, fit_space
+from gsencoder.train.prepared import PreparedDataset
 from gsencoder.train.run import encoder_trainer
-from gsencoder.train.samples import (
-    Augmentation,
-    SampleDataset,
-    SampleRecipe,
-    SamplingConfig,
-    TeacherRecipe,
-    TrainingScene,
-)
-from gsencoder.train.space import fit_space
+from gsencoder.train.samples import Augmentation, SampleDataset, SampleRecipe, SamplingConfig, TrainingScene
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
 TABLE = np.array([[0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]], np.float32)
@@ -117,7 +110,7 @@ def prepared(folder: Path, *, count: int = 3, teacher: Teacher | None = None) ->
     chosen: Teacher = teacher
     fit_space(dataset, [Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
     for number in range(count):
-        dataset.prepare(scene(number), teacher, PREPARE, source=Path(f"wall_{number}"))
+        add_scene(dataset, scene(number), teacher, PREPARE, source=Path(f"wall_{number}"))
     dataset.count_classes(names, untracked)
     return dataset, names
 

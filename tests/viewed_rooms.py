@@ -9,11 +9,11 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.page.page import MAGIC, Bundle, Container
 from gsencoder.infer.page.search import SceneSearch, drawn_scene, object_numbers
-from gsencoder.text.table import TextTable, load_text_table, make_text_table, save_text_table
+from gsencoder.text.table import WORDS_FILE, TextTable, load_text_table, make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
 HOSTILE = "<img src=x onerror=\"document.title='harmed'\"></script><script>document.title='harmed'</script>\u202e&amp;'"

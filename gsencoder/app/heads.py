@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, find_head, head_features, load_heads
 from gsencoder.infer.localize import select_features
-from gsencoder.teachers.heads import TEXT_KINDS, Head, text_kind
+from gsencoder.models.output_space import HEADS_FILE
+from gsencoder.teachers.base import TEXT_KINDS, Head, text_kind
 from gsencoder.text.models import TransformersTower
 from gsencoder.text.table import TextTable, TextTower, load_text_table
 from gsencoder.text.vocabulary import (

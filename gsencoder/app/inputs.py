@@ -5,11 +5,10 @@ from pathlib import Path
 from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import warn_of_faults
+from gsencoder.data.orbits import CamerasOfSplat
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.up import with_up
-from gsencoder.fusion.cameras import INSIDE, CamerasOfSplat, with_views
-from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.render import BlendConfig
 from gsencoder.types import Scene
 
@@ -32,7 +31,10 @@ def load_fusable(
         scene = load_scene(path, splat=splat or None, options=data)
     with run.step("check"):
         warn_of_faults(scene)
-        scene = with_fitting_splat(scene, splat, data)
+        if splat:
+            from gsencoder.fusion.fit import with_fitting_splat
+
+            scene = with_fitting_splat(scene, splat, data)
     if scene.views is None and labels:
         raise InputError(
             f"{path}: a splat without views has no labels for teacher=labels; give a teacher that looks at pictures, "
@@ -45,6 +47,8 @@ def load_fusable(
     run.report_up(scene.name, up)
     if scene.views is not None:
         return scene
+    from gsencoder.fusion.cameras import INSIDE, with_views
+
     with run.step("cameras"):
         scene, reason = with_views(scene, orbits, blend, cameras=cameras)
     assert scene.views is not None

@@ -8,10 +8,10 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import find_file
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.fusion.folder import MEMORY_FILE, WORDS_FILE, load_features, load_memories, table_path, teachers_in
+from gsencoder.fusion.folder import MEMORY_FILE, load_features, load_memories
 from gsencoder.infer.localize import select_features
 from gsencoder.infer.views.photographs import with_photographs
-from gsencoder.text.table import TextTable, load_text_table
+from gsencoder.text.table import WORDS_FILE, TextTable, load_text_table, table_path, teachers_in
 from gsencoder.text.vocabulary import (
     TableTextConfig,
     TextConfig,

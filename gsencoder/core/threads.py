@@ -179,9 +179,11 @@ def _one_thread() -> Iterator[None]:
 
 
 def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1) -> Iterator[Result]:
-    """`work` of each item, in order; the next ones are computed in `workers` threads while the caller uses the last.
-    The threads that `parallel` has are shared out among the workers, which have the caller's context variables."""
-    share = max(1, thread_count() // workers)
+    """`work` of each item, in order; the next ones are computed in at most `workers` threads while the caller uses the
+    last. The threads that `parallel` has are shared out among these, which have the caller's context variables."""
+    threads = thread_count()
+    workers = min(workers, threads)
+    share = threads // workers
     pending: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(workers, initializer=_limit_threads, initargs=(share,)) as pool:
         try:

@@ -1,7 +1,7 @@
 """Cameras around a bare splat, for splats that come without views."""
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,6 +11,8 @@ from gsencoder.types import Cameras, Gaussians
 from gsencoder.types.checks import look_at, perpendicular
 from gsencoder.types.scene import intrinsic_matrix
 
+CamerasOfSplat = Literal["auto", "around", "inside"]
+"""Where cameras of a splat without views stand; "auto" = inside a room (`gsencoder.fusion.cameras`)."""
 COVERED = 0.95  # Opacity-weighted share of the Gaussians that must fit into the picture
 MAX_COVERED = 3.0
 """Largest radius that must fit, in opacity-weighted median distances from the center; farther Gaussians are floaters.

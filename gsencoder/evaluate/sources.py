@@ -21,15 +21,15 @@ from gsencoder.core.process import Clock
 from gsencoder.data.labels.mesh import nearest_rows
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.fusion.errors import sample_cells
+from gsencoder.fusion.basis import sample_cells
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, head_features, measure_heads
 from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.relevancy import relevancy
 from gsencoder.render import blend
-from gsencoder.teachers.build import TeacherConfig, build_teacher
-from gsencoder.teachers.heads import Head
+from gsencoder.teachers.base import Head
+from gsencoder.teachers.build import TeacherConfig
 from gsencoder.text.table import TextEncoder, TextTable, check_space
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, MeshLabels, Scene
@@ -43,7 +43,7 @@ def fusion_source(teacher: TeacherConfig, words: Words | None, config: FuseConfi
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         with Clock().running() as clock:
-            features = fuse(scene, build_teacher(teacher, scene, words), config).features
+            features = fuse(scene, teacher.build(scene, words), config).features
         return features, clock.seconds
 
     return source
@@ -102,7 +102,7 @@ def fused_head_source(
     def outputs(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         assert scene.views is not None
         with Clock().running() as clock:
-            fusion = fuse(scene, build_teacher(teacher, scene, None), config)
+            fusion = fuse(scene, teacher.build(scene, None), config)
         start, sample = time.perf_counter(), sample_cells(fusion.teacher, scene.views, fusion.views)
         heads = measure_heads([head], sample.vectors(), fusion.features.space, fusion.features.basis)
         through = head_features(fusion.features, heads.heads[0], heads.space, text_encoder=text_encoder)

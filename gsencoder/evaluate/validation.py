@@ -24,8 +24,7 @@ from gsencoder.render import blend
 from gsencoder.render.images import render_image
 from gsencoder.train.distributed import current_process, summed_array
 from gsencoder.train.loop import ValidationResult
-from gsencoder.train.prepare import nearest_codes
-from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.prepared import PreparedScene, nearest_codes
 from gsencoder.train.samples import TrainingScene
 
 PICTURED_SCENES = 3

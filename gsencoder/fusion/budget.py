@@ -33,14 +33,13 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Track, untracked
 from gsencoder.core.settings import option
 from gsencoder.core.threads import parallel
-from gsencoder.fusion.basis import distinct_rows
+from gsencoder.fusion.basis import FieldError, distinct_rows, judge, row_cosines
 from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher, cached_maps, upright
-from gsencoder.fusion.coordinates import reduce_to_fit
-from gsencoder.fusion.errors import FieldError, judge, row_cosines
+from gsencoder.fusion.folder import reduce_to_fit
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse, validate_scene
-from gsencoder.fusion.lift import SAMPLE, VisibilityConfig, coverage_order, resolve, sample_view
+from gsencoder.fusion.lift import SAMPLE, VisibilityConfig, coverage_order, sample_view
 from gsencoder.render import BlendConfig
-from gsencoder.render.rays import Lattice
+from gsencoder.render.blend_cpu import Lattice
 from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureMap, Gaussians, Scene, Views
 
@@ -169,14 +168,14 @@ def fuse_within(
     check_budget(budget, config)
     start, teacher = clock(), upright(teacher)
     gaussians, views = validate_scene(scene)
-    visibility, exact = resolve(config.visibility, views, config.lift), exact_config(config)
+    exact = exact_config(config)
     if work is not None and not teacher.cheap:
         settings = {"budget": "maps", "lift": config.lift}
         teacher = cached_maps(work, settings, teacher, gaussians, views, range(len(views)), None)
     maps, count = KeptMaps(teacher), len(views)
     order, sampled = bisection_order(count), None
     if budget.error is not None and not (teacher.cheap and count <= ALL_VIEWS):
-        sampled = sample_views(gaussians, views, maps, visibility, exact.blend)
+        sampled = sample_views(gaussians, views, maps, config.visibility, exact.blend)
         order = sampled.order
 
     @cache
@@ -290,11 +289,7 @@ class SampledViews:
 def sample_views(
     gaussians: Gaussians, views: Views, teacher: KeptMaps, visibility: VisibilityConfig, config: BlendConfig
 ) -> SampledViews:
-    """Looks at views on a few rays, and makes some maps.
-
-    Args:
-        visibility: resolved; against sensor depth, or nothing.
-    """
+    """Looks at views on a few rays, and makes some maps."""
     count, spread = len(views), bisection_order(len(views))
     looked_at = spread[: max(ALL_VIEWS, math.ceil(count / VIEWS_SHARE))]
     maps = min(CHEAP_MAPS if teacher.cheap else max(FIRST_MAPS, math.ceil(count / MAPS_SHARE)), len(looked_at))

@@ -1,7 +1,7 @@
 """Cameras inside a bare splat of a room: from outside, one sees the backs of its walls, which no photograph shows."""
 
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.data.enclosure import enclosure_of
-from gsencoder.data.orbits import looking_cameras, orbit_cameras, spiral_directions
+from gsencoder.data.orbits import CamerasOfSplat, looking_cameras, orbit_cameras, spiral_directions
 from gsencoder.render import BlendConfig
 from gsencoder.render.images import OPAQUE, RenderedImages, visible_shares
 from gsencoder.types import Cameras, Gaussians, Scene, Views
@@ -144,16 +144,8 @@ def _cover(shares: Float64[np.ndarray, "V C"], weights: Float64[np.ndarray, " C"
     return chosen
 
 
-MOST_ORBITS = 10_000
-CamerasOfSplat = Literal["auto", "around", "inside"]
 AROUND, INSIDE = "orbit", "inside"
 """What the names of views begin with."""
-
-
-def check_orbits(count: int) -> None:
-    """Complains of a number of cameras that nobody means."""
-    if not 1 <= count <= MOST_ORBITS:
-        raise InputError(f"orbits: expected 1 to {MOST_ORBITS} cameras, got {count}")
 
 
 def with_views(

@@ -3,31 +3,29 @@
 Features of one teacher are in `features.safetensors`, those of several in a file each, `features.TEACHER.safetensors`.
 Memories, which are decoded to features when they are read, are in `memory.safetensors` or `memory.TEACHER.safetensors`.
 Arrays are safetensors files, memory-mapped on load; features are float16 for seen rows only. The folder is all that
-localization needs: no photographs, no teacher. Next to them may lie text tables, and adapter heads, whose layers
-`gsencoder.fusion.measured_heads` reads with torch.
+localization needs: no photographs, no teacher. Next to them may lie text tables (`gsencoder.text.table`) and adapter
+heads (`gsencoder.models.output_space`). Features with fewer coordinates, along principal axes, take fewer bytes.
 """
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float16, Float32, Int32
+from jaxtyping import Float16, Float32, Float64, Int32
 
 from gsencoder.core.archive import (
     LONGEST_SHARE,
     Archive,
     archive_bytes,
-    copy_checked,
     open_archive,
     shape_only,
-    verify_archive,
     write_archive,
 )
-from gsencoder.core.arrays import is_strictly_increasing
+from gsencoder.core.arrays import even_indices, is_strictly_increasing
+from gsencoder.core.budget import MEGABYTE, Budget
 from gsencoder.core.errors import InputError
 from gsencoder.core.threads import parallel
 from gsencoder.data.scene_arrays import (
@@ -43,7 +41,8 @@ from gsencoder.data.scene_arrays import (
 from gsencoder.data.scenes import kind_of_path
 from gsencoder.data.splats.files import FINGERPRINT_DIGITS, fingerprint
 from gsencoder.fusion.package import PACKAGE_FILE, load_package
-from gsencoder.text.table import TextTable, load_text_table, save_text_table
+from gsencoder.fusion.quantize import centered_rows
+from gsencoder.text.table import file_of_teacher, teachers_in
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, QueryMemory, Scene
 
 MEMORY_FILE = "memory.safetensors"
@@ -111,23 +110,6 @@ def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 BLOCK = 16_384
 """Rows that are turned into half precision at a time."""
-WORDS_FILE = "words.safetensors"
-"""The text table whose words lead into the features, where there is one."""
-TEACHER_NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
-"""Form of the names of teachers, which are parts of names of files."""
-
-
-def file_of_teacher(file: str, teacher: str | None) -> str:
-    """The name of a file for one of several teachers, such as `features.labels.safetensors`; None = the only one."""
-    stem, dot, suffix = file.partition(".")
-    return file if teacher is None else f"{stem}.{teacher}{dot}{suffix}"
-
-
-def teachers_in(folder: Path, file: str) -> list[str]:
-    """The teachers of which a folder has such files."""
-    stem, dot, suffix = file.partition(".")
-    form = re.compile(re.escape(stem) + rf"\.({TEACHER_NAME})" + re.escape(dot + suffix))
-    return sorted(match[1] for path in folder.iterdir() if (match := form.fullmatch(path.name)))
 
 
 def save_features(
@@ -151,7 +133,7 @@ def save_features(
     if isinstance(features, GaussianFeatures):
         features = {features.space.name: features}
     single = len(features) == 1
-    by_file = {file_of_teacher(FEATURES_FILE, None if single else name): each for name, each in features.items()}
+    by_file = {FEATURES_FILE if single else file_of_teacher(FEATURES_FILE, name): features[name] for name in features}
     wrong = [len(each) for each in by_file.values() if gaussians is None or len(gaussians) != len(each)]
     if gaussians is None or wrong:
         raise InputError(f"save_features: {wrong[0]} features need as many Gaussians in scene {scene.name}")
@@ -178,8 +160,8 @@ def _write_scene(folder: Path, scene: Scene, gaussians: Gaussians) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
-    around, header = scene_parts(scene)
     arrays = {name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+    around, header = scene_parts(scene)
     write_archive(folder / SCENE_FILE, arrays | around, header)
 
 
@@ -351,91 +333,115 @@ def _load_rows(folder: Path, name: str, gaussians: Gaussians) -> GaussianFeature
         return GaussianFeatures(features=values, weights=weights, mean=mean, space=space, basis=basis)
 
 
-def save_tables(
-    folder: Path,
-    tables: Mapping[str, TextTable],
-    teachers: Iterable[str],
-    *,
-    dtype: Literal["float32", "float16"] = "float32",
-) -> None:
-    """Writes text tables, by the teacher in whose space they are, next to features or weights. `teachers` are all of
-    the features or the encoder, with tables or not; a single one is not named in files."""
-    single = len(list(teachers)) == 1
-    for teacher, table in tables.items():
-        save_text_table(folder / file_of_teacher(WORDS_FILE, None if single else teacher), table, dtype=dtype)
+SAMPLE = 20_000
+"""Gaussians from which axes are computed."""
+AXES_BLOCK = 65_536
+"""Rows that are turned to their principal axes at a time."""
 
 
-def load_tables(folder: Path, teachers: Iterable[str]) -> dict[str, TextTable]:
-    """The text tables of a folder by teacher; teachers without a file are left out."""
-    names = list(teachers)
-    paths = {name: folder / file_of_teacher(WORDS_FILE, name if len(names) > 1 else None) for name in names}
-    return {name: load_text_table(path) for name, path in paths.items() if path.is_file()}
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PrincipalAxes:
+    """The axes of some features.
 
+    Attributes:
+        axes: in the coordinates of the features, those with most energy first.
+        errors: mean of 1 − centered cosine with the first 1, 2, … of them.
+        energies: shares of the energy of directions that these keep.
+    """
 
-def table_path(folder: Path, text_encoder: str) -> Path | None:
-    """The file in a folder of features whose words lead into the features of a space with this text encoder; None where
-    there is none, and an InputError where there are only those of other spaces."""
-    if (folder / WORDS_FILE).is_file():
-        return folder / WORDS_FILE
-    if not text_encoder:
-        return None
-    paths = [folder / file_of_teacher(WORDS_FILE, teacher) for teacher in teachers_in(folder, WORDS_FILE)]
-    encoders = {path: load_text_table(path).space.text_encoder for path in paths}
-    fitting = [path for path, encoder in encoders.items() if encoder == text_encoder]
-    if paths and not fitting:
-        raise InputError(
-            f"{folder}: no {file_of_teacher(WORDS_FILE, 'TEACHER')} holds words of {text_encoder}, which lead into "
-            f"these features (there are words of {', '.join(sorted(set(encoders.values())))}): the file was lost; give "
-            "words= or text=, or name other features with space="
+    axes: Float64[np.ndarray, "R R"]
+    errors: Float64[np.ndarray, " R"]
+    energies: Float64[np.ndarray, " R"]
+
+    def rank_within(self, error: float) -> int:
+        """The smallest number of axes that keeps an error; all of them where none does."""
+        within = np.flatnonzero(self.errors <= error)
+        return int(within[0]) + 1 if len(within) else len(self.errors)
+
+    def reduced(self, features: GaussianFeatures, rank: int) -> GaussianFeatures:
+        """The features that the axes are of, with `rank` coordinates."""
+        axes, basis = self.axes[:rank], features.basis
+        values = np.zeros((len(features), rank), np.float32)
+        seen = np.flatnonzero(features.seen)
+        for start in range(0, len(seen), AXES_BLOCK):
+            rows = seen[start : start + AXES_BLOCK]
+            values[rows] = centered_rows(features, rows) @ axes.T
+        return GaussianFeatures(
+            features=values,
+            weights=features.weights,
+            mean=features.mean,
+            space=features.space,
+            basis=FeatureBasis(
+                mean=features.mean,
+                components=np.ascontiguousarray(axes if basis is None else axes @ basis.components, np.float32),
+                energy_kept=float(self.energies[rank - 1]) * (1.0 if basis is None else basis.energy_kept),
+                space=features.space,
+            ),
         )
-    return fitting[0] if fitting else None
 
 
-HEADS_FILE = "heads.safetensors"
-"""The adapter heads that take the features, where there are some."""
+def principal_axes(features: GaussianFeatures) -> PrincipalAxes:
+    """The axes of features without an index, on an evenly spaced sample; each direction counts the same."""
+    seen = np.flatnonzero(features.seen)
+    values = centered_rows(features, seen[even_indices(len(seen), SAMPLE)])
+    norms = np.linalg.norm(values, axis=1, keepdims=True)
+    unit = values[norms[:, 0] > 0] / norms[norms[:, 0] > 0]
+    _, vectors = np.linalg.eigh(unit.T @ unit)
+    axes = vectors[:, ::-1].T
+    shares = np.square(unit @ axes.T).cumsum(axis=1)
+    if not len(unit):
+        return PrincipalAxes(axes=axes, errors=np.zeros(len(axes)), energies=np.ones(len(axes)))
+    return PrincipalAxes(
+        axes=axes,
+        errors=np.maximum(1 - np.sqrt(shares).mean(axis=0), 0),
+        energies=np.minimum(shares.mean(axis=0), 1),
+    )
 
 
-def find_heads(weights: Path) -> Path | None:
-    """The file of adapter heads of an encoder's file, or None: heads.safetensors in its folder, and for an exported
-    graph `heads_of_graph`."""
-    path = heads_of_graph(weights) if weights.suffix.lower() == ".onnx" else weights.with_name(HEADS_FILE)
-    return path if path.is_file() else None
+class Reduced(NamedTuple):
+    """Features whose files keep a limit of megabytes.
+
+    Attributes:
+        error: that leaving out coordinates adds, of the teacher that loses most.
+    """
+
+    features: dict[str, GaussianFeatures]
+    ranks: dict[str, int]
+    error: float
+    megabytes: float
 
 
-def heads_of_graph(graph: Path) -> Path:
-    """Where the adapter heads of an exported graph lie: FILE.onnx.heads.safetensors."""
-    return graph.with_name(f"{graph.name}.{HEADS_FILE}")
-
-
-def copy_heads(
-    source: Path, target: Path, spaces: Sequence[FeatureSpace], *, left_out: Sequence[FeatureSpace] = ()
-) -> None:
-    """Copies a file of adapter heads; an earlier one is replaced once the copy is whole.
+def reduce_to_fit(
+    features: Mapping[str, GaussianFeatures], budget: Budget, header: Mapping[str, Any], *, error: float = 0.0
+) -> Reduced:
+    """Features with as many coordinates as fit into a limit of megabytes, or as a limit of error needs. Teachers share
+    the bytes in proportion to what all their coordinates take.
 
     Args:
-        spaces: of the features or the weights, one for each teacher; the heads take features of one of them.
-        left_out: spaces of the other teachers of the source; heads that take features of these are not copied.
+        header: the settings that `save_features` writes with them, which take bytes.
+        error: what features may lose where the budget limits the error.
     """
-    with open_archive(source) as file:
-        heads = read_heads_space(file)
-        if heads in left_out:
-            return
-        check_heads_space(heads, next((space for space in spaces if space == heads), spaces[0]))
-        file.verify()
-    copy_checked(source, target, verify_archive)
+    limit = budget.limit("megabytes") * MEGABYTE
 
+    def size(name: str, rank: int) -> int:
+        each = features[name]
+        # All channels have no basis, which takes bytes of its own.
+        all_channels = each.basis is None and rank == each.features.shape[1]
+        return features_bytes(each.space, int(each.seen.sum()), rank, header, basis=not all_channels)
 
-def read_heads_space(file: Archive) -> FeatureSpace:
-    """The space of the features that the heads of a file take."""
-    values = file.value("space", dict)
-    if set(values) != set(FeatureSpace.__dataclass_fields__):
-        raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
-    return FeatureSpace(**values)
-
-
-def check_heads_space(heads: FeatureSpace, features: FeatureSpace) -> None:
-    if heads != features:
-        raise InputError(
-            f"the heads take features of ({heads.describe()}), and these are of ({features.describe()}); expected "
-            "heads of the same backbone with the same settings"
-        )
+    full = {name: each.features.shape[1] for name, each in features.items()}
+    full_sizes = {name: size(name, rank) for name, rank in full.items()}
+    ranks, lost, reduced = dict(full), 0.0, dict(features)
+    if sum(full_sizes.values()) > limit:
+        for name, each in features.items():
+            axes, share = principal_axes(each), limit * full_sizes[name] / sum(full_sizes.values())
+            fitting = [rank for rank in range(1, full[name] + 1) if size(name, rank) <= share]
+            needed = axes.rank_within(error) if "error" in budget.limits else 1
+            ranks[name] = rank = max([needed, *fitting])
+            if rank < full[name]:
+                reduced[name] = axes.reduced(each, rank)
+                lost = max(lost, float(axes.errors[rank - 1]))
+    megabytes = sum(size(name, rank) for name, rank in ranks.items()) / MEGABYTE
+    if megabytes > budget.limit("megabytes") and "error" not in budget.limits:
+        raise budget.too_small(megabytes)
+    return Reduced(reduced, ranks, lost, megabytes)

@@ -7,9 +7,8 @@ does not grow with the number of views or with the teacher's width.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -22,10 +21,10 @@ from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Track, timed, untracked
 from gsencoder.core.settings import CheckedConfig, option
-from gsencoder.core.threads import ahead, thread_count
+from gsencoder.core.threads import ahead
 from gsencoder.fusion.basis import Moments, distinct_rows, fit_basis, table_basis
 from gsencoder.fusion.checkpoint import cached_maps, upright
-from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, covering_views, resolve, view_matrix
+from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, covering_views, depth_sources, view_matrix
 from gsencoder.render import Blend, BlendConfig
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Scene, Teacher, Views
 
@@ -122,31 +121,30 @@ def fuse(
         InputError: nothing to lift or to lift onto, no view sees anything, or `work` holds another run.
     """
     gaussians, views = validate_scene(scene)
-    rows = select_views(gaussians, views, config) if rows is None else tuple(rows)
     teacher = upright(teacher)
+    rows = select_views(gaussians, views, config) if rows is None else tuple(rows)
     if work is not None:
         teacher = cached_maps(work, asdict(config), teacher, gaussians, views, rows, basis)
-    maps = timed("teacher")(partial(teacher.feature_map, views))
     target = choose_device(device) if isinstance(device, str) else device
 
     if basis is None:
-        basis, mean = find_basis(teacher, maps, rows, config, track)
+        basis, mean = find_basis(teacher, views, rows, config, track)
     elif basis.space != teacher.space:
         raise InputError(f"fuse: the basis is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
     else:
         mean = basis.mean
-    visibility = resolve(config.visibility, views, config.lift)
+    sources = depth_sources(config.visibility, views, config.lift)
     sums = FeatureSums(len(gaussians), teacher.space, basis, teacher.table, target, with_mean=mean is None)
 
     def prepare(view: int) -> tuple[FeatureMap, Blend]:
-        feature_map = maps(view)
+        feature_map = map_of(teacher, views, view)
         matrix = view_matrix(
             gaussians,
             views,
             view,
             feature_map,
             lift=config.lift,
-            visibility=visibility,
+            visibility=config.visibility,
             config=config.blend,
             device=target,
         )
@@ -154,7 +152,7 @@ def fuse(
 
     # A costly teacher has threads of its own and may have large maps: its views are prepared one after the other.
     side_by_side = teacher.cheap and target.type == "cpu"
-    prepared = ahead(prepare, rows, min(thread_count(), VIEWS_AT_ONCE)) if side_by_side else map(prepare, rows)
+    prepared = ahead(prepare, rows, VIEWS_AT_ONCE) if side_by_side else map(prepare, rows)
     for view, (feature_map, matrix) in zip(track(rows, "lifting views"), prepared, strict=True):
         sums.add(matrix, feature_map, views.masks[view] if views.masks is not None else None)
     features, weights = sums.finish()
@@ -170,7 +168,7 @@ def fuse(
             basis=basis,
         ),
         views=rows,
-        depth_sources=visibility.against,
+        depth_sources=sources,
         config=config,
         teacher=teacher,
     )
@@ -189,14 +187,20 @@ def select_views(gaussians: Gaussians, views: Views, config: FuseConfig) -> tupl
     """Row numbers of the views that are used."""
     share = max(1, math.ceil(config.view_share * len(views) - 1e-9))
     count = min(config.views or len(views), share, len(views))
+    if count == len(views):
+        return tuple(range(count))
     if config.view_choice == "coverage":
-        visibility = resolve(config.visibility, views, config.lift)
-        return covering_views(gaussians, views, visibility, config.blend, count)
+        return covering_views(gaussians, views, config.visibility, config.blend, count)
     return tuple(even_indices(len(views), count).tolist())
 
 
+@timed("teacher")
+def map_of(teacher: Teacher, views: Views, view: int) -> FeatureMap:
+    return teacher.feature_map(views, view)
+
+
 def find_basis(
-    teacher: Teacher, maps: Callable[[int], FeatureMap], rows: Sequence[int], config: FuseConfig, track: Track
+    teacher: Teacher, views: Views, rows: Sequence[int], config: FuseConfig, track: Track
 ) -> tuple[FeatureBasis | None, Float32[np.ndarray, " D"] | None]:
     """The basis of a teacher's vectors, where `config` asks for one, and their mean, where it is known before views are
     lifted. Maps of all views are made where neither a table nor a small number of channels makes that unnecessary."""
@@ -207,10 +211,11 @@ def find_basis(
         return None, mean
     if table is not None:
         assert mean is not None
-        return timed("basis")(table_basis)(table, mean, space, energy=config.table_energy), mean
+        energy = config.table_energy
+        return timed("basis")(table_basis)(table, mean, space, energy=energy), mean
     moments = Moments(space.channels)
     for view in track(rows, "finding the basis"):
-        timed("basis")(moments.add)(distinct_rows(maps(view)))
+        timed("basis")(moments.add)(distinct_rows(map_of(teacher, views, view)))
     basis = timed("basis")(fit_basis)(
         moments.mean, moments.covariance(), space, energy=config.energy, max_rank=config.max_rank
     )

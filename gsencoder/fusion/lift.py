@@ -16,7 +16,7 @@ from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import kernel, parallel
 from gsencoder.fusion.basis import Moments, distinct_rows, to_coordinates
 from gsencoder.render import Blend, BlendConfig, blend
-from gsencoder.render.rays import Lattice, grid_lattice
+from gsencoder.render.blend_cpu import Lattice, grid_lattice
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Gaussians, Views
 
 Source = Literal["auto", "sensor", "rendered"]
@@ -38,17 +38,17 @@ class VisibilityConfig:
             raise InputError("against: a test against a depth map needs relative or absolute above 0; [] = no test")
 
 
-def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConfig:
-    """The same with "auto" replaced: sensor depth where there is one; else rendered depth for centers, which see
-    through walls without a test, and none for B, whose weights are what is left behind other Gaussians."""
+def depth_sources(config: VisibilityConfig, views: Views, lift: str) -> tuple[Source, ...]:
+    """The depth maps to test against. "auto" is sensor depth where there is one; else rendered depth for centers, which
+    see through walls without a test, and none for B, whose weights are what is left behind other Gaussians."""
     has_depth = views.depths is not None
     if "sensor" in config.against and not has_depth:
         raise InputError(
             "visibility.against=sensor: the scene has no sensor depth; test against rendered depth instead"
         )
     automatic: tuple[Source, ...] = ("sensor",) if has_depth else ("rendered",) if lift == "center" else ()
-    against = [name for source in config.against for name in (automatic if source == "auto" else (source,))]
-    return replace(config, against=tuple(dict.fromkeys(against)))
+    sources = [name for source in config.against for name in (automatic if source == "auto" else (source,))]
+    return tuple(dict.fromkeys(sources))
 
 
 def _interval(
@@ -193,8 +193,9 @@ class FeatureSums:
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
 
-    def _product(self, sums: torch.Tensor, table: Float32[np.ndarray, "C columns"]) -> torch.Tensor:
-        """Sums by code as sums of the vectors of a table."""
+    def _product(self, sums: torch.Tensor, table: Float32[np.ndarray, "C D"]) -> torch.Tensor:
+        """Sums by code as sums of the vectors of a table, in columns."""
+        table = self._in_columns(table)
         if self.device.type == "cpu":
             return torch.from_numpy(sums.numpy() @ table)
         return sums @ self._tensor(table)
@@ -212,7 +213,7 @@ class FeatureSums:
             if len(own):
                 sums = self._zeros(len(self._weights), len(own))
                 _lift_shares_into(b, feature_map, share, sums)
-                self._sums += self._product(sums, self._in_columns(own))
+                self._sums += self._product(sums, own)
                 self._weights += sums.sum(dim=1, keepdim=True)
         else:
             maps, scale = self._vectors(feature_map, share)
@@ -253,7 +254,7 @@ class FeatureSums:
             weights, sums = self.weights, self.sums
         else:
             weights = self.sums.sum(axis=1)
-            sums = self._product(self._sums, self._in_columns(self.table)).cpu().numpy()
+            sums = self._product(self._sums, self.table).cpu().numpy()
         # A row whose whole weight is below the smallest normal number would divide into noise or infinity.
         seen = weights > np.finfo(np.float32).tiny
         features = np.divide(sums, weights[:, None], where=seen[:, None], out=np.zeros_like(sums))
@@ -303,10 +304,9 @@ def view_matrix(
     """The matrix that a view's map is lifted with: B of its cells, or one entry for each visible center.
 
     Args:
-        visibility: what hides an entry, resolved (`resolve`).
         device: where B is made and held against depth maps; centers are tested on the CPU, and go there as a matrix.
     """
-    depths = depth_maps(gaussians, views, view, visibility, config, device)
+    depths = depth_maps(gaussians, views, view, depth_sources(visibility, views, lift), config, device)
     if lift == "center":
         return center_matrix(gaussians, views, view, feature_map, depths, visibility, config).to(device)
     config = limit_rays(config, feature_map)
@@ -328,13 +328,13 @@ def depth_maps(
     gaussians: Gaussians,
     views: Views,
     view: int,
-    visibility: VisibilityConfig,
+    sources: Sequence[Source],
     config: BlendConfig,
     device: str | torch.device = "cpu",
 ) -> list[Float32[np.ndarray, "H W"]]:
     """The depth maps that entries are held against, world units, 0 = none."""
     maps = []
-    for source in visibility.against:
+    for source in sources:
         if source == "sensor":
             assert views.depths is not None
             maps.append(views.depths[view])
@@ -386,7 +386,7 @@ SAMPLE = 20_000
 def sample_view(
     gaussians: Gaussians, views: Views, view: int, visibility: VisibilityConfig, config: BlendConfig
 ) -> Blend:
-    """B of every k-th pixel of a view in both directions, one ray a row, with `visibility` resolved."""
+    """B of every k-th pixel of a view in both directions, one ray a row."""
     width, height = int(views.cameras.widths[view]), int(views.cameras.heights[view])
     # Odd, so that rays pass through the centers of pixels.
     step = 2 * max(round((math.sqrt(width * height / RAYS) - 1) / 2), 0) + 1
@@ -424,10 +424,8 @@ def covering_views(
     gaussians: Gaussians, views: Views, visibility: VisibilityConfig, config: BlendConfig, count: int
 ) -> tuple[int, ...]:
     """Row numbers of `count` views, ascending, each of which shows most of what those before it do not; a test against
-    rendered depth does not count. `visibility` is resolved."""
-    if count >= len(views):
-        return tuple(range(len(views)))
-    against = replace(visibility, against=tuple(source for source in visibility.against if source == "sensor"))
+    rendered depth does not count."""
+    against = replace(visibility, against=tuple(source for source in visibility.against if source != "rendered"))
     sample = even_indices(len(gaussians), SAMPLE)
 
     def seen(view: int) -> Bool[np.ndarray, " n"]:

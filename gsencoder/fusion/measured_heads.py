@@ -22,8 +22,8 @@ from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, error_prefix
 from gsencoder.fusion.basis import WORST, to_coordinates
-from gsencoder.fusion.folder import check_heads_space, read_heads_space
-from gsencoder.teachers.heads import PARTS, TEXT_KINDS, Head, Residual, default_part, split_name
+from gsencoder.models.output_space import check_heads_space, read_heads_space
+from gsencoder.teachers.base import PARTS, TEXT_KINDS, Head, Residual, default_part, split_name
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 CHUNK = 4096

@@ -21,7 +21,7 @@ from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import ahead
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
 from gsencoder.models.grid import cut_scene_curves
 from gsencoder.models.output_space import OutputSpaces, find_weights

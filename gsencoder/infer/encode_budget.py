@@ -28,9 +28,8 @@ from gsencoder.core.budget import (
 )
 from gsencoder.core.process import Precision, Track, untracked
 from gsencoder.core.settings import option
-from gsencoder.fusion.coordinates import reduce_to_fit
-from gsencoder.fusion.errors import FieldError, judge, row_cosines
-from gsencoder.fusion.folder import features_bytes
+from gsencoder.fusion.basis import FieldError, judge, row_cosines
+from gsencoder.fusion.folder import features_bytes, reduce_to_fit
 from gsencoder.infer.encode import Chunk, EncodeConfig, Encoder, cut, scene_regions
 from gsencoder.types import GaussianFeatures, Gaussians
 

@@ -10,13 +10,11 @@ from jaxtyping import Float32
 from gsencoder.core.device import autocast_dtype, choose_device
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Precision
-from gsencoder.fusion.folder import load_tables
 from gsencoder.infer.onnx.runtime import EncoderHeader, Run
-from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
+from gsencoder.models.encoder import GaussianEncoder, encoder_inputs, load_weights
 from gsencoder.models.grid import SceneCurves
 from gsencoder.models.output_space import OutputSpaces, find_weights
-from gsencoder.models.weights import load_weights
-from gsencoder.text.table import TextTable
+from gsencoder.text.table import TextTable, load_tables
 from gsencoder.types import Gaussians
 
 

@@ -16,7 +16,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.budget import MEGABYTE, Estimate, choose
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import check_limits, option
-from gsencoder.fusion.errors import row_cosines
+from gsencoder.fusion.basis import row_cosines
 from gsencoder.fusion.package import PackBudget
 from gsencoder.fusion.quantize import FIT_SAMPLE, rarity_of
 from gsencoder.memory.reduction import BLOCK, CoverReduction, largest_threshold

@@ -9,7 +9,7 @@ teacher's vectors themselves.
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.core.archive import Archive, open_archive
+from gsencoder.core.archive import Archive, copy_checked, open_archive, verify_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import open_foreign
 from gsencoder.core.pretrained import find_file
@@ -282,3 +282,53 @@ def load_output_spaces(source: str, option: str = "weights") -> OutputSpaces:
     """Reads the output spaces of an encoder's weights, without the encoder; arguments are those of `find_weights`."""
     with open_archive(find_weights(source, option)) as file:
         return read_output_spaces(file)
+
+
+HEADS_FILE = "heads.safetensors"
+"""The adapter heads that take the features, where there are some."""
+
+
+def find_heads(weights: Path) -> Path | None:
+    """The file of adapter heads of an encoder's file, or None: heads.safetensors in its folder, and for an exported
+    graph `heads_of_graph`."""
+    path = heads_of_graph(weights) if weights.suffix.lower() == ".onnx" else weights.with_name(HEADS_FILE)
+    return path if path.is_file() else None
+
+
+def heads_of_graph(graph: Path) -> Path:
+    """Where the adapter heads of an exported graph lie: FILE.onnx.heads.safetensors."""
+    return graph.with_name(f"{graph.name}.{HEADS_FILE}")
+
+
+def copy_heads(
+    source: Path, target: Path, spaces: Sequence[FeatureSpace], *, left_out: Sequence[FeatureSpace] = ()
+) -> None:
+    """Copies a file of adapter heads; an earlier one is replaced once the copy is whole.
+
+    Args:
+        spaces: of the features or the weights, one for each teacher; the heads take features of one of them.
+        left_out: spaces of the other teachers of the source; heads that take features of these are not copied.
+    """
+    with open_archive(source) as file:
+        heads = read_heads_space(file)
+        if heads in left_out:
+            return
+        check_heads_space(heads, next((space for space in spaces if space == heads), spaces[0]))
+        file.verify()
+    copy_checked(source, target, verify_archive)
+
+
+def read_heads_space(file: Archive) -> FeatureSpace:
+    """The space of the features that the heads of a file take."""
+    values = file.value("space", dict)
+    if set(values) != set(FeatureSpace.__dataclass_fields__):
+        raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
+    return FeatureSpace(**values)
+
+
+def check_heads_space(heads: FeatureSpace, features: FeatureSpace) -> None:
+    if heads != features:
+        raise InputError(
+            f"the heads take features of ({heads.describe()}), and these are of ({features.describe()}); expected "
+            "heads of the same backbone with the same settings"
+        )

@@ -6,7 +6,7 @@ Morton order, so that tokens that are close in space are mostly close in memory.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int32, Int64, Integer
@@ -22,7 +22,10 @@ from gsencoder.models.grid import (
     curve_from_morton,
     morton_codes,
 )
-from gsencoder.models.neighbors import KernelSize, neighbor_table
+
+KernelSize = Literal[3, 5]
+"""Edge k of the cube of k³ cells around a cell. Cell o = k²·(dx + r) + k·(dy + r) + (dz + r) with r = (k − 1) / 2: the
+center is (k³ − 1) / 2, and k³ − 1 − o is opposite o."""
 
 
 def grid_coords(points: Tensor, voxel: float, corner: Tensor | None = None) -> Int64[Tensor, "N 3"]:
@@ -107,6 +110,63 @@ class CloudPlan(NamedTuple):
     counts: Int64[Tensor, " T"]
     levels: tuple[CloudLevel, ...]
     stem_neighbors: Int32[Tensor, "T 125"] | None = None
+
+
+def forward_columns(size: KernelSize) -> tuple[tuple[int, int], ...]:
+    """Steps (dx, dy) to the columns of a neighborhood that come after the center's; the others are opposite them."""
+    radius = size // 2
+    steps = range(-radius, radius + 1)
+    return tuple((dx, dy) for dx in steps for dy in steps if (dx, dy) > (0, 0))
+
+
+def neighbor_table(cells: Int64[Tensor, "N 3"], size: KernelSize = 3) -> Int32[Tensor, "N cube"]:
+    """For each of N distinct cells, the rows of the size³ cells around it; N for cells that are not occupied.
+
+    Cells are sorted by column. For each forward column one binary search finds where the cells of the neighborhood
+    would begin; they follow one another from there. Each match is entered at both cells.
+    """
+    n, cube, radius = len(cells), size**3, size // 2
+    if n == 0:
+        return torch.zeros((0, cube), dtype=torch.int32, device=cells.device)
+    low, high = cells.aminmax(dim=0)
+    # A border of empty cells on each side keeps the end of one column apart from the start of the next.
+    sizes = (high - low + 1 + 2 * radius).tolist()
+    stride_y, stride_x = sizes[2], sizes[2] * sizes[1]
+    x, y, z = (cells - low + radius).unbind(dim=1)
+    keys = x * stride_x + y * stride_y + z
+    # The keys of a room fit into half the bits, which are sorted in a quarter of the time.
+    keys, order = torch.sort(keys.int() if sizes[0] * stride_x < 2**31 else keys)
+    positions = torch.arange(n, dtype=torch.int32, device=cells.device)
+    missing = positions.new_full((), n)
+    # Entry [o, i] is the position among the sorted cells of neighbor o of the cell at position i. Column n takes the
+    # writes of cells that are missing.
+    table = positions.new_full((cube, n + 1), n)
+    table[cube // 2, :n] = positions
+    # Two entries that no key equals let the walk along a column run past the end.
+    padded = torch.cat((keys, keys.new_full((2,), torch.iinfo(keys.dtype).max)))
+    above = positions + 1
+    for step in range(1, radius + 1):
+        hit = padded.index_select(0, above) == keys + step
+        table[cube // 2 + step, :n] = torch.where(hit, above, missing)
+        table[cube // 2 - step].scatter_(0, table[cube // 2 + step, :n].long(), positions)
+        above = above + hit
+    columns = forward_columns(size)
+    offsets = keys.new_tensor([dx * stride_x + dy * stride_y - radius for dx, dy in columns])
+    target_keys = keys + offsets[:, None]
+    position = torch.searchsorted(keys, target_keys, out_int32=True)
+    for step in range(size):
+        hit = padded.index_select(0, position.flatten()).view(len(columns), n) == target_keys
+        neighbor = torch.where(hit, position, missing)
+        for column, (dx, dy) in enumerate(columns):
+            cell = size**2 * (dx + radius) + size * (dy + radius) + step
+            table[cell, :n] = neighbor[column]
+            table[cube - 1 - cell].scatter_(0, neighbor[column].long(), positions)
+        position += hit
+        target_keys += 1
+    rows = torch.cat((order.int(), missing[None])).index_select(0, table.flatten()).view(cube, n + 1)
+    position_of_row = torch.empty_like(order)
+    position_of_row[order] = torch.arange(n, device=order.device)
+    return rows[:, :n].T.contiguous().index_select(0, position_of_row)
 
 
 def plan_cloud(

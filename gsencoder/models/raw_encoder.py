@@ -20,9 +20,8 @@ from gsencoder.models.grid import (
     morton_codes,
     swap_xy,
 )
-from gsencoder.models.neighbors import KernelSize, forward_columns
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.models.plan import Level, Plan
+from gsencoder.models.plan import KernelSize, Level, Plan, forward_columns
 from gsencoder.models.transformer import TransformerConfig, embed
 
 
@@ -157,7 +156,7 @@ def _children(first: Int64[Tensor, " M"], total: int) -> Int64[Tensor, "M 8"]:
 
 
 def _neighbor_table(cells: Int64[Tensor, "T 3"], size: KernelSize = 3) -> Int32[Tensor, "T cube"]:
-    """The twin of `neighbors.neighbor_table`, without strides that Python would have to read."""
+    """The twin of `plan.neighbor_table`, without strides that Python would have to read."""
     count, radius, columns = cells.shape[0], size // 2, forward_columns(size)
     low, high = cells.amin(dim=0), cells.amax(dim=0)
     sizes = high - low + 1 + 2 * radius

@@ -1,4 +1,5 @@
-"""The point transformer (PTv3, Wu et al. 2024): input channels, attention in patches, pooling and unpooling.
+"""The point transformer (PTv3, Wu et al. 2024): input channels, sparse convolution, attention in patches, pooling
+and unpooling.
 
 The input channels do not depend on where the scene lies, nor on the sign and the axis order that a file chose. A
 quaternion and three scales describe the same ellipsoid in 48 ways, and a network would have to learn that they are
@@ -9,10 +10,10 @@ can be left out.
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int64, Integer
+from jaxtyping import Bool, Float, Int32, Int64, Integer
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -20,14 +21,121 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.settings import check_limits, option
 from gsencoder.geometry import rotmats_from_quats
 from gsencoder.models.grid import ALIGN, Order
-from gsencoder.models.neighbors import NeighborConv
-from gsencoder.models.plan import ORDERS, Level, Plan
+from gsencoder.models.plan import ORDERS, KernelSize, Level, Plan
 from gsencoder.types import SH_C0
 
 MLP_RATIO = 4
 """Hidden channels of a block's MLP, as a multiple of its channels."""
 MASKED_SCORE = -3e4
 """Added to attention scores of masked slots in an exported graph; finite in half precision."""
+OCCUPIED: dict[int, int] = {3: 10, 5: 28}
+"""Cells of a neighborhood that are occupied on a surface, approximately, by the edge of the neighborhood."""
+
+CPU_BLOCK_ROWS = 8192
+"""Rows whose neighborhoods are gathered together on a CPU, few enough that what they gather stays in its cache."""
+
+FEW_CELLS = 9
+"""A block of tokens that needs at most one in so many cells of a neighborhood multiplies these alone: isolated tokens,
+and lines of them. It changes rounding only; surfaces, which need a third of the cells, keep every bit."""
+
+
+class NeighborConv(nn.Module):
+    """A submanifold sparse convolution: out[i] = Σ_o W_o x[neighbor o of i] + bias over occupied cells, others being 0.
+
+    It gathers neighborhoods and multiplies once, which needs only torch. Since the neighborhood is symmetric, the
+    gradient is the same convolution with the weights of opposite cells swapped, so that no atomics are needed.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int, size: KernelSize = 3) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(size**3, channels_in, channels_out))
+        self.bias = nn.Parameter(torch.zeros(channels_out))
+        nn.init.normal_(self.weight, std=(OCCUPIED[size] * channels_in) ** -0.5)
+
+    def forward(self, x: Float[Tensor, "N C"], neighbors: Integer[Tensor, "N cube"]) -> Float[Tensor, "N D"]:
+        weight: Tensor = self.weight
+        bias: Tensor = self.bias
+        if torch.is_autocast_enabled(x.device.type):
+            dtype = torch.get_autocast_dtype(x.device.type)
+            x, weight, bias = x.to(dtype), weight.to(dtype), bias.to(dtype)
+        return convolve(x, neighbors, weight) + bias
+
+
+def convolve_reference(
+    x: Float[Tensor, "N C"], neighbors: Int32[Tensor, "N cube"], weight: Float[Tensor, "cube C D"]
+) -> Float[Tensor, "N D"]:
+    """The plain twin of `NeighborConv` without bias: one gather and one product, differentiated by autograd."""
+    padded = torch.cat((x, x.new_zeros(1, x.shape[1])))
+    return padded[neighbors.long()].flatten(1) @ weight.flatten(0, 1)
+
+
+# Operators of their own, which `gsencoder.infer.onnx.export` translates to standard ONNX operators.
+@torch.library.custom_op("gsencoder::convolve", mutates_args=())
+def convolve(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
+    """`convolve_reference`, computed in blocks of rows, on a CPU without the cells that no row of a block needs."""
+    padded, matrix = _append_zero_row(x), weight.flatten(0, 1)
+    out = x.new_empty(len(x), matrix.shape[1])
+    for rows in _row_blocks(len(x), x.device):
+        cells, columns = neighbors[rows], matrix
+        if x.device.type == "cpu":
+            occupied = cells.amin(dim=0) < len(x)
+            if FEW_CELLS * int(occupied.sum()) <= len(occupied):
+                cells, columns = cells[:, occupied], weight[occupied].flatten(0, 1)
+        torch.mm(_gather_neighborhoods(padded, cells), columns, out=out[rows])
+    return out
+
+
+@convolve.register_fake
+def _(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
+    return x.new_empty(neighbors.shape[0], weight.shape[2])
+
+
+@torch.library.custom_op("gsencoder::convolve_weight_gradient", mutates_args=())
+def convolve_weight_gradient(x: Tensor, neighbors: Tensor, grad: Tensor) -> Tensor:
+    """The gradient of `convolve` with respect to its weight, (cube, C, D), from that with respect to its result.
+
+    It is summed in float32 at least.
+    """
+    padded = _append_zero_row(x)
+    shape = (neighbors.shape[1], x.shape[1], grad.shape[1])
+    total = x.new_zeros(shape, dtype=torch.promote_types(x.dtype, torch.float32)).flatten(0, 1)
+    for rows in _row_blocks(len(x), x.device):
+        total += _gather_neighborhoods(padded, neighbors[rows]).T @ grad[rows]
+    return total.view(shape).to(x.dtype)
+
+
+@convolve_weight_gradient.register_fake
+def _(x: Tensor, neighbors: Tensor, grad: Tensor) -> Tensor:
+    return x.new_empty(neighbors.shape[1], x.shape[1], grad.shape[1])
+
+
+def _save_inputs(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:  # noqa: ARG001
+    ctx.save_for_backward(*inputs)
+
+
+def _gradients(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None]:
+    x, neighbors, weight = ctx.saved_tensors
+    grad = grad.contiguous()
+    # Cell j is neighbor o of i exactly where i is the neighbor of j on the opposite side.
+    grad_x = convolve(grad, neighbors, weight.flip(0).transpose(1, 2)) if ctx.needs_input_grad[0] else None
+    grad_weight = convolve_weight_gradient(x, neighbors, grad) if ctx.needs_input_grad[2] else None
+    return grad_x, None, grad_weight
+
+
+convolve.register_autograd(_gradients, setup_context=_save_inputs)
+
+
+def _append_zero_row(x: Tensor) -> Tensor:
+    return torch.cat((x, x.new_zeros(1, x.shape[1])))
+
+
+def _gather_neighborhoods(padded: Tensor, neighbors: Tensor) -> Tensor:
+    return padded.index_select(0, neighbors.reshape(-1)).view(neighbors.shape[0], -1)
+
+
+def _row_blocks(n: int, device: torch.device) -> list[slice]:
+    size = CPU_BLOCK_ROWS if device.type == "cpu" else max(n, 1)
+    return [slice(start, start + size) for start in range(0, n, size)]
 
 
 class PatchAttention(nn.Module):

@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Float, Float32, Int32, Int64
 from torch import Tensor
 
-from gsencoder import geometry
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import CheckedConfig, option
+from gsencoder.geometry import project
 from gsencoder.render import blend_cpu, blend_torch
-from gsencoder.render.rays import Lattice, grid_lattice, patch_lattice, strided_lattice
+from gsencoder.render.blend_cpu import Lattice, grid_lattice, patch_lattice, strided_lattice
 from gsencoder.types import Cameras, FeatureMap, Gaussians
 
 Backend = Literal["auto", "cpu", "torch", "reference"]
@@ -257,7 +257,7 @@ def blend(
 
     # A projection costs little, so that float64 is affordable also where a GPU is slow in it; see `blend_torch`.
     precise = dtype if backend == "reference" else torch.float64
-    projected = geometry.project(
+    projected = project(
         tensor(gaussians.means, precise),
         tensor(gaussians.quats, precise),
         tensor(gaussians.scales, precise),

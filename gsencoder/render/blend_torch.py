@@ -12,7 +12,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN, Projected
-from gsencoder.render.rays import Lattice
+from gsencoder.render.blend_cpu import Lattice
 
 ROUND = 32
 """Gaussians of each tile that are composited in one round."""

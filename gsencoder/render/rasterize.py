@@ -21,14 +21,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gsencoder import geometry
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import PIECES, kernel, parallel
-from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
+from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN, project
 from gsencoder.render import blend_torch
-from gsencoder.render.blend_cpu import bin_tiles, even_cuts
-from gsencoder.render.rays import strided_lattice
+from gsencoder.render.blend_cpu import bin_tiles, even_cuts, strided_lattice
 
 RasterBackend = Literal["auto", "cpu", "reference", "gsplat"]
 
@@ -86,7 +84,7 @@ def rasterize(
     if backend == "gsplat":
         return rasterize_gsplat(means, quats, scales, opacities, colors, cam_from_world, K, width, height, config)
     knobs, stop = {"eps2d": config.eps2d, "near": config.near}, config.stop_transmittance
-    projected = geometry.project(means, quats, scales, opacities, cam_from_world, K, width, height, **knobs)
+    projected = project(means, quats, scales, opacities, cam_from_world, K, width, height, **knobs)
     values = torch.cat((colors, projected.depths.unsqueeze(1)), dim=1)
     if backend == "cpu":
         rows = projected.valid.nonzero().squeeze(1)

@@ -1,9 +1,9 @@
 """The teachers by name, the words that lead into their spaces, and the choice of one for a scene (`teacher=auto`)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Literal
 
 from gsencoder.core.errors import InputError, renamed_options
 from gsencoder.core.settings import option
@@ -76,20 +76,6 @@ def stored_words(teacher: Teacher, words: Words | None) -> TextTable | None:
     if isinstance(words, OpenVocabulary):
         words = words.including(getattr(teacher, "kinds", ()))
     return closed_table(words)
-
-
-def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> Teacher:
-    """The teacher of a scene; `words` are from `words_of(config)`, which is read once for many scenes."""
-    return config.build(scene, words)
-
-
-def load_teacher_heads(config: TeacherConfig, names: Sequence[str], option: str = "heads") -> list[Any]:
-    """Adapter heads (`gsencoder.teachers.heads.Head`) of a teacher, by names that `option` gives."""
-    if not names:
-        return []
-    if not config.has_heads:
-        raise InputError(f"{option}={names[0]}: teacher={config.name} has no adapter heads; teacher=radio has some")
-    return config.read_heads(names)
 
 
 NAMES_TABLE = LabelsConfig().words
@@ -169,4 +155,4 @@ def default_teacher(scene: Scene) -> tuple[Teacher, Words]:
     with."""
     chosen = choose_teacher(AutoConfig(), TableTextConfig(), scene)
     assert chosen.words is not None
-    return build_teacher(chosen.teacher, scene, chosen.words), chosen.words
+    return chosen.teacher.build(scene, chosen.words), chosen.words

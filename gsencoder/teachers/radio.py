@@ -25,8 +25,18 @@ from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import digest_files, find_file, load_pretrained, read_config, read_weights, weight_names
 from gsencoder.core.process import Device
 from gsencoder.core.settings import option
-from gsencoder.teachers.base import Teacher, TeacherSettings, check_channels, text_encoder_of
-from gsencoder.teachers.heads import Head, Part, Residual, default_part, split_name, text_kind
+from gsencoder.teachers.base import (
+    Head,
+    Part,
+    Residual,
+    Teacher,
+    TeacherSettings,
+    check_channels,
+    default_part,
+    split_name,
+    text_encoder_of,
+    text_kind,
+)
 from gsencoder.teachers.pictures import Preprocessing, TorchTeacher
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import FeatureSpace, Scene
@@ -65,7 +75,9 @@ class RadioConfig(TeacherSettings):
     def stored_heads(self) -> tuple[str, ...]:
         return self.heads
 
-    def read_heads(self, names: Sequence[str]) -> "list[Head]":
+    def read_heads(self, names: Sequence[str], option: str = "heads") -> list[Head]:  # noqa: ARG002
+        if not names:
+            return []
         folder = radio_folder(self)
         return read_radio_heads(folder, names, check_radio(folder))
 

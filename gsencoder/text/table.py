@@ -10,7 +10,7 @@ import os
 import re
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.archive import open_archive, read_npz, write_archive
-from gsencoder.core.errors import InputError, SceneWarning, error_prefix, readable
-from gsencoder.core.files import open_foreign
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix
 from gsencoder.types import FeatureSpace
 
 KINDS = ("onnx", "transformers")
@@ -302,11 +301,7 @@ def load_text_table(path: str | Path) -> TextTable:
     file = Path(path)
     if not file.is_file():
         raise InputError(f"{file}: no such file; expected a text table (.npz or .safetensors)")
-    with readable(file), open_foreign(file) as stream:
-        zipped = stream.read(2) == b"PK"
-    if zipped or file.suffix == ".npz":
-        return _read_npz(file)
-    return _read_archive(file)
+    return _read_npz(file) if file.suffix == ".npz" else _read_archive(file)
 
 
 def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float32", "float16"] = "float32") -> None:
@@ -472,3 +467,62 @@ def _write(path: Path, cached: dict[str, Float32[np.ndarray, " D"]]) -> None:
 
 REFERENCE_NOUNS = tuple(Path(__file__).with_name("nouns.txt").read_text(encoding="utf-8").splitlines())
 """Everyday nouns; the mean of the vectors of these alone is that of a tower."""
+
+
+WORDS_FILE = "words.safetensors"
+"""The text table whose words lead into the features, where there is one."""
+TEACHER_NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
+"""Form of the names of teachers, which are parts of names of files."""
+
+
+def file_of_teacher(file: str, teacher: str | None) -> str:
+    """The name of a file for one of several teachers, such as `features.labels.safetensors`; None = the only one."""
+    stem, dot, suffix = file.partition(".")
+    return file if teacher is None else f"{stem}.{teacher}{dot}{suffix}"
+
+
+def teachers_in(folder: Path, file: str) -> list[str]:
+    """The teachers of which a folder has such files."""
+    stem, dot, suffix = file.partition(".")
+    form = re.compile(re.escape(stem) + rf"\.({TEACHER_NAME})" + re.escape(dot + suffix))
+    return sorted(match[1] for path in folder.iterdir() if (match := form.fullmatch(path.name)))
+
+
+def save_tables(
+    folder: Path,
+    tables: Mapping[str, TextTable],
+    teachers: Iterable[str],
+    *,
+    dtype: Literal["float32", "float16"] = "float32",
+) -> None:
+    """Writes text tables, by the teacher in whose space they are, next to features or weights. `teachers` are all of
+    the features or the encoder, with tables or not; a single one is not named in files."""
+    single = len(list(teachers)) == 1
+    for teacher, table in tables.items():
+        save_text_table(folder / file_of_teacher(WORDS_FILE, None if single else teacher), table, dtype=dtype)
+
+
+def load_tables(folder: Path, teachers: Iterable[str]) -> dict[str, TextTable]:
+    """The text tables of a folder by teacher; teachers without a file are left out."""
+    names = list(teachers)
+    paths = {name: folder / file_of_teacher(WORDS_FILE, name if len(names) > 1 else None) for name in names}
+    return {name: load_text_table(path) for name, path in paths.items() if path.is_file()}
+
+
+def table_path(folder: Path, text_encoder: str) -> Path | None:
+    """The file in a folder of features whose words lead into the features of a space with this text encoder; None where
+    there is none, and an InputError where there are only those of other spaces."""
+    if (folder / WORDS_FILE).is_file():
+        return folder / WORDS_FILE
+    if not text_encoder:
+        return None
+    paths = [folder / file_of_teacher(WORDS_FILE, teacher) for teacher in teachers_in(folder, WORDS_FILE)]
+    encoders = {path: load_text_table(path).space.text_encoder for path in paths}
+    fitting = [path for path, encoder in encoders.items() if encoder == text_encoder]
+    if paths and not fitting:
+        raise InputError(
+            f"{folder}: no {file_of_teacher(WORDS_FILE, 'TEACHER')} holds words of {text_encoder}, which lead into "
+            f"these features (there are words of {', '.join(sorted(set(encoders.values())))}): the file was lost; give "
+            "words= or text=, or name other features with space="
+        )
+    return fitting[0] if fitting else None

@@ -391,7 +391,7 @@ class Trainer:
         weight_decay: float = 0.05,
         final_rate: float = 0.01,
         tensorboard: bool = False,
-        validate: Callable[[Any], ValidationResult] = lambda network: ValidationResult({}),  # noqa: ARG005
+        validate: Callable[[Any], ValidationResult] | None = None,
     ) -> None:
         """Sets up training, and resumes from the checkpoint in `folder` if there is one.
 
@@ -556,17 +556,17 @@ class Trainer:
             # A term of a teacher that no scene of a step has is not among the losses of that step.
             names = dict.fromkeys(name for losses in recent for name in losses)
             row = {name: float(np.mean([losses[name] for losses in recent if name in losses])) for name in names}
-        if is_last or (config.validate_every and step % config.validate_every == 0):
+        if self.validate is not None and (is_last or (config.validate_every and step % config.validate_every == 0)):
             with fail_together():
-                row |= self._run_validation(step)
+                row |= self._run_validation(step, self.validate)
         if row and self._log is not None:
             self._log.add(step, row | {"seconds": self.state.seconds})
         self.state = replace(self.state, unlogged=() if log_due else recent, closed=True)
 
-    def _run_validation(self, step: int) -> dict[str, float]:
+    def _run_validation(self, step: int, validate: Callable[[Any], ValidationResult]) -> dict[str, float]:
         """Validates in all processes; returns the columns of the log, which are empty on all but the first."""
         self.network.eval()
-        self.last_validation = result = self.validate(self.network)
+        self.last_validation = result = validate(self.network)
         if self._log is None:
             return {}
         for name, pixels in result.pictures.items():

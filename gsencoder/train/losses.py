@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float16, Int32, Int64
 from torch import Tensor, nn
@@ -16,8 +17,12 @@ from torch.nn import functional
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import check_limits, option
+from gsencoder.fusion.measured_heads import HeadSet
+from gsencoder.models.output_space import OutputSpace, check_heads_space
+from gsencoder.models.plan import Plan
 from gsencoder.render import Blend, BlendConfig
-from gsencoder.render.rays import Lattice
+from gsencoder.render.blend_cpu import Lattice
+from gsencoder.train.prepared import ClassBalance
 
 EPS = 1e-12
 
@@ -99,6 +104,33 @@ class TeacherTargets(NamedTuple):
     codes: Int64[Tensor, " N"]
     loss_weights: Float[Tensor, " N"]
     rows: RenderRows
+
+
+class Batch(NamedTuple):
+    """A batch of samples, concatenated along Gaussians, tokens and rows; `names` are scene and views of each sample,
+    for messages. In scenes that lack a teacher its targets have no weight."""
+
+    names: tuple[str, ...]
+    attributes: Float[Tensor, "N A"]
+    opacities: Float[Tensor, " N"]
+    plan: Plan
+    teachers: tuple[TeacherTargets, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TeacherRecipe:
+    """A teacher of a training: the weight of its losses, and whether its targets have classes that a term of the loss
+    may compare. The columns of the codebook are the teacher's columns of the encoder's outputs."""
+
+    name: str
+    class_balance: ClassBalance
+    weight: float = 1.0
+    classes: bool = True
+
+    @property
+    def channels(self) -> int:
+        """Columns of its targets."""
+        return self.class_balance.codebook.shape[1]
 
 
 class AdapterHead(nn.Module):
@@ -244,3 +276,90 @@ TERMS: Mapping[str, Term] = {
     ),
 }
 """The terms by name; the weight of NAME is `LossConfig.NAME_weight`."""
+
+
+class FeatureDecoder(nn.Module):
+    """Decodes outputs of the encoder to vectors of the teacher's space; differentiable."""
+
+    mean: Tensor
+    components: Tensor
+
+    def __init__(self, outputs: OutputSpace) -> None:
+        super().__init__()
+        rows = np.eye(outputs.channels, dtype=np.float32) if outputs.basis is None else outputs.basis.components
+        mean = outputs.mean if outputs.centered else np.zeros_like(outputs.mean)
+        self.register_buffer("mean", torch.from_numpy(mean.copy()))
+        self.register_buffer("components", torch.from_numpy(rows * np.float32(outputs.unit)))
+
+    def forward(self, standard: Float[Tensor, "n channels"]) -> Float[Tensor, "n D"]:
+        out: Tensor = standard @ self.components + self.mean
+        return out
+
+
+def render_heads(heads: HeadSet, outputs: OutputSpace) -> list[tuple[AdapterHead, nn.Module]]:
+    """Heads as the render loss takes them, each with a decoder from standard units to its input."""
+    if not heads.heads:
+        return []
+    check_heads_space(heads.space, outputs.space)
+    decode = FeatureDecoder(outputs)
+    return [(AdapterHead(each.head.body, torch.from_numpy(each.mean), each.scale), decode) for each in heads.heads]
+
+
+class Distillation:
+    """The loss L = Σ_teachers w · Σ_terms λ_term · L_term over the terms of `TERMS`, as totals before division.
+
+    In a step each term is Σ total / Σ weight over all micro-batches of all processes. The weights are known before
+    anything is computed, so each micro-batch divides its totals by the sum of the step's weights, and gradients are
+    simply added. A term of one of several teachers is called TEACHER/TERM, such as "labels/field".
+    """
+
+    advice = "loss.min_alpha, loss.min_kept and loss.rarity"
+
+    def __init__(
+        self,
+        network: nn.Module,
+        config: LossConfig,
+        teachers: Sequence[TeacherRecipe],
+        *,
+        heads: Mapping[str, Heads] = {},
+        device: torch.device = torch.device("cpu"),
+    ) -> None:
+        """The `network` is a `GaussianEncoder`, possibly wrapped for several processes; teachers are in the order of
+        its output columns, and adapter heads by teacher."""
+        self.network, self.config = network, config
+        self._widths = [teacher.channels for teacher in teachers]
+        self._codebooks = [torch.from_numpy(each.class_balance.codebook).to(device) for each in teachers]
+        self._heads = [
+            [(head.to(device), decode.to(device)) for head, decode in heads.get(each.name, ())] for each in teachers
+        ]
+        self._terms = [
+            (name if len(teachers) == 1 else f"{teacher.name}/{name}", weight * teacher.weight, number, TERMS[name])
+            for number, teacher in enumerate(teachers)
+            for name, weight in config.lambdas.items()
+            if weight * teacher.weight and (teacher.classes or not TERMS[name].classes)
+        ]
+
+    @property
+    def lambdas(self) -> dict[str, float]:
+        """The weights of the terms that are not 0, by name."""
+        return {name: weight for name, weight, _, _ in self._terms}
+
+    def divisors(self, batch: Batch) -> dict[str, float]:
+        """The sum of the weights of a batch's Gaussians or rows, for each term."""
+        return {
+            name: float(term.weights(batch.teachers[number]).double().sum()) for name, _, number, term in self._terms
+        }
+
+    def __call__(self, batch: Batch) -> dict[str, Tensor]:
+        """Totals of the terms whose weight is not 0, for the encoder's predictions."""
+        return self.terms(self.network(batch.attributes, batch.opacities, batch.plan), batch)
+
+    def terms(self, predicted: Float[Tensor, "N C"], batch: Batch) -> dict[str, Tensor]:
+        """Totals of the terms whose weight is not 0; the terms of a teacher that the batch's scenes lack are 0."""
+        with torch.autocast(predicted.device.type, enabled=False):
+            columns = predicted.split(self._widths, dim=1)
+            inputs = [
+                LossInputs(*each, self.config)
+                for each in zip(columns, batch.teachers, self._codebooks, self._heads, strict=True)
+            ]
+            return {name: term.total(inputs[number]) for name, _, number, term in self._terms}

@@ -43,7 +43,7 @@ from gsencoder.teachers.base import Teacher
 from gsencoder.train.loop import Trainer, TrainerConfig, TrainingState
 from gsencoder.train.losses import EPS, RenderRows
 from gsencoder.train.prepare import PrepareConfig, view_rows
-from gsencoder.train.prepared_file import PreparedScene, write_prepared
+from gsencoder.train.prepared import PreparedScene, write_prepared
 from gsencoder.train.samples import join_rows, sample_rows
 from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory, Scene
 from gsencoder.types.features import Scoring

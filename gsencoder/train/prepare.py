@@ -1,46 +1,47 @@
 """Preparation of scenes for training: everything that does not depend on the encoder is computed once and stored.
 
-Loss weights are by class frequency, since a floor has 10⁵ Gaussians and a spoon has forty. The class of a target is the
-nearest vector of a codebook: the vectors of a coded teacher's table, or cluster centers of a dense teacher's features.
-A Gaussian of a class with n Gaussians in the dataset is weighted by n^−power.
+The scenes of a dataset share the output space (mean, scale and basis) and adapter heads of its teacher. A coded
+teacher's space is that of its tables. That of a dense one is of the moments of maps that are evenly distributed over
+the scenes and their views, over which heads are measured, too. Distilled features must work with the heads as the
+teacher's features do (SplatDistill Eq. 4); both sides of that loss are decoded from the dataset's basis.
 """
 
-import hashlib
-import json
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Int64
 
-from gsencoder.core.archive import open_archive, write_archive
+from gsencoder.core.archive import write_archive
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.errors import InputError, error_hint, listed, readable
-from gsencoder.core.files import locked, read_foreign
-from gsencoder.core.process import ProcessRank, Track
-from gsencoder.core.settings import check_limits, first_difference, option
-from gsencoder.fusion.basis import to_coordinates
+from gsencoder.core.errors import InputError
+from gsencoder.core.files import locked
+from gsencoder.core.process import ProcessRank, Track, untracked
+from gsencoder.core.settings import check_limits, option
+from gsencoder.fusion.basis import (
+    CellSample,
+    Moments,
+    distinct_rows,
+    fit_basis,
+    project_maps,
+    table_basis,
+    to_coordinates,
+)
 from gsencoder.fusion.checkpoint import CachedTeacher, upright
-from gsencoder.fusion.errors import project_maps
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import limit_rays, row_mask
-from gsencoder.models.output_space import OutputSpace, read_output_space
+from gsencoder.fusion.measured_heads import HeadSet, choose_heads, has_head, load_heads, measure_heads, save_heads
+from gsencoder.models.output_space import HEADS_FILE, OutputSpace, check_heads_space, output_space_parts
 from gsencoder.render import blend
-from gsencoder.teachers.base import Teacher
-from gsencoder.train.distributed import fail_together, summed_array, value_of_first
-from gsencoder.train.prepared_file import (
-    Precision,
-    PreparedScene,
-    ViewRows,
-    digest_of_files,
-    stored_precision,
-    write_prepared,
-)
-from gsencoder.types import FeatureMap, Scene
+from gsencoder.teachers.base import Head, MissingInput, Teacher
+from gsencoder.teachers.build import TeacherConfig
+from gsencoder.train.distributed import fail_together
+from gsencoder.train.prepared import SPACE_FILE, Precision, PreparedDataset, ViewRows, write_prepared
+from gsencoder.types import FeatureMap, FeatureSpace, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,6 +78,163 @@ class PrepareConfig:
             )
 
 
+OpenScene = Callable[[Path], tuple[Scene, Teacher]]
+"""Reads a scene without making Gaussians, and builds its teacher; a `MissingInput` where it lacks what that needs."""
+MAX_CELLS_PER_MAP = 4096
+"""Approximate limit of the cells of one teacher map that enter the moments."""
+
+
+def open_teachers(
+    scenes: Sequence[Path], open_scene: OpenScene, *, optional: bool = False
+) -> Iterator[tuple[Path, Teacher]]:
+    """Scenes with their teachers; with `optional` without those that lack what their teacher needs.
+
+    Raises:
+        MissingInput: a scene lacks what the teacher needs, or with `optional` all do; then the message has that of
+            the first.
+    """
+    missing, opened = "", False
+    for path in scenes:
+        try:
+            _, teacher = open_scene(path)
+        except MissingInput as error:
+            if not optional:
+                raise
+            missing = missing or str(error)
+            continue
+        opened = True
+        yield path, teacher
+    if not opened:
+        raise MissingInput(f"no scene to train on has what it needs; the first one: {missing}")
+
+
+def sampled_maps(
+    scenes: Sequence[Path], open_scene: OpenScene, views: int, *, optional: bool = False
+) -> Iterator[tuple[Path, Teacher, FeatureMap]]:
+    """Paths, teachers and maps that stand for a dataset, evenly distributed over its scenes and their views: `views` of
+    them, fewer where the scenes have fewer views. With `optional` scenes that lack what the teacher needs are left
+    out."""
+    if optional:
+        scenes = [path for path, _ in open_teachers(scenes, open_scene, optional=True)]
+    counts = np.diff(np.linspace(0, views, len(scenes) + 1).round()).astype(int)
+    counts[0] = max(1, counts[0])
+    for path, count in zip(scenes, counts.tolist(), strict=True):
+        if count:
+            scene, teacher = open_scene(path)
+            assert scene.views is not None
+            for view in even_indices(len(scene.views), count).tolist():
+                yield path, teacher, upright(teacher).feature_map(scene.views, view)
+
+
+def fit_space(
+    dataset: PreparedDataset,
+    scenes: Sequence[Path],
+    open_scene: OpenScene,
+    config: PrepareConfig,
+    *,
+    optional: bool = False,
+    process: ProcessRank = ProcessRank(),
+    track: Track = untracked,
+) -> None:
+    """Computes and stores the output space of the training scenes of a dataset, unless it is stored already. All
+    processes of a training call this, and the first one does it; the arguments are those of `dataset_space`."""
+    path = dataset.folder / SPACE_FILE
+    with fail_together():
+        if process.is_first and not path.is_file():
+            outputs, codebook, kinds = dataset_space(scenes, open_scene, config, optional=optional, track=track)
+            arrays, header = output_space_parts(outputs)
+            if codebook is not None:
+                arrays["codebook"] = codebook
+            dataset.folder.mkdir(parents=True, exist_ok=True)
+            # Another run that prepares the same scenes may have stored a space in the meantime, and scenes in it.
+            if not path.is_file():
+                write_archive(path, arrays, {**header, "kinds": list(kinds), "made_with": dataset.settings})
+
+
+def dataset_space(
+    scenes: Sequence[Path],
+    open_scene: OpenScene,
+    config: PrepareConfig,
+    *,
+    optional: bool = False,
+    track: Track = untracked,
+) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None, tuple[str, ...]]:
+    """Computes the output space of a dataset.
+
+    Args:
+        open_scene: reads a scene and builds its teacher.
+        config: the basis, the number of maps of a dense teacher, and whether targets are centered and scaled.
+        optional: leave out scenes that lack what the teacher needs, since they have other teachers.
+
+    Returns:
+        The space; for a coded teacher its vectors in standard units, else None; and the names of the things that the
+        teacher tells apart, if it has names.
+    """
+    if not scenes:
+        raise InputError("training: no scenes to train on")
+    spaces, tables, kinds = list[FeatureSpace](), list[np.ndarray](), dict[str, None]()
+    mean, fusion = None, config.fusion
+    for path, teacher in open_teachers(scenes, open_scene, optional=optional):
+        spaces.append(teacher.space)
+        check_space(spaces[0], teacher.space, path)
+        if teacher.table is None:
+            break
+        kinds |= dict.fromkeys(getattr(teacher, "kinds", ()))
+        tables.append(teacher.table)
+        mean = teacher.mean if teacher.mean is not None else mean
+    space = spaces[0]
+    use_basis = fusion.wants_basis(space)
+    table = basis = codebook = None
+    if tables:
+        table = np.unique(np.concatenate(tables), axis=0)
+        mean = table.mean(axis=0) if mean is None else mean
+        variance = np.square(table - mean, dtype=np.float64).sum(axis=1).mean()
+        basis = table_basis(table, mean, space, energy=fusion.table_energy) if use_basis else None
+    else:
+        moments, kinds = Moments(space.channels), dict[str, None]()
+        maps = sampled_maps(scenes, open_scene, config.basis_views, optional=optional)
+        # The moments of each scene are merged, since chunks about a scene's own mean keep more digits.
+        for _, of_scene in track(groupby(maps, key=lambda each: each[0]), "fitting the basis"):
+            part = Moments(space.channels)
+            for path, teacher, feature_map in of_scene:
+                check_space(space, teacher.space, path)
+                kinds |= dict.fromkeys(getattr(teacher, "kinds", ()))
+                rows = distinct_rows(feature_map)
+                part.add(rows[:: max(1, len(rows) // MAX_CELLS_PER_MAP)])
+            moments.merge(part)
+        # The mean of the sampled maps, even if the teacher has another one: the covariance is about it.
+        mean, covariance = moments.mean.astype(np.float32), moments.covariance()
+        variance = np.trace(covariance)
+        if use_basis:
+            center = mean.astype(np.float64)
+            basis = fit_basis(center, covariance, space, energy=fusion.energy, max_rank=fusion.max_rank)
+    if not variance > 0:
+        raise InputError(
+            f"training: the teacher ({space.describe()}) gives the same features everywhere in these scenes; "
+            "there is nothing to learn. Check the images, and the teacher's features of these scenes (`gsencoder fuse`)"
+        )
+    outputs = OutputSpace(
+        space=space,
+        mean=mean,
+        scale=float(np.sqrt(variance)),
+        basis=basis,
+        centered=config.center,
+        scaled=config.scale,
+    )
+    if table is not None:
+        codebook = outputs.standardize(table if basis is None else to_coordinates(basis, table))
+    return outputs, codebook, tuple(kinds)
+
+
+def check_space(space: FeatureSpace, other: FeatureSpace, path: Path) -> None:
+    """Checks that a scene's teacher has the feature space of the scenes before it."""
+    if space != other:
+        raise InputError(
+            f"training: expected one feature space for all scenes, got several feature spaces: ({space.describe()}), "
+            f"and in {path} ({other.describe()})"
+        )
+
+
 def prepare_scene(
     path: Path,
     scene: Scene,
@@ -94,8 +252,10 @@ def prepare_scene(
     fusion = replace(config.fusion, basis=outputs.basis is not None)
     fused = fuse(scene, teacher, fusion, basis=outputs.basis, device=device)
     chosen = even_indices(len(scene.views), config.render_views or len(scene.views))
-    rows = view_rows(scene, teacher, outputs, config, chosen, device)
-    projections = None if outputs.basis is None else project_maps(outputs.basis, teacher, scene.views, fused.views)
+    rows = view_rows(scene, fused.teacher, outputs, config, chosen, device)
+    projections = (
+        None if outputs.basis is None else project_maps(outputs.basis, fused.teacher, scene.views, fused.views)
+    )
     with_rows = replace(scene, views=scene.views.select(chosen))
     write_prepared(
         path,
@@ -130,8 +290,8 @@ def view_rows(
         )
         if scene.views.masks is not None:
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
-        arrays = tuple(each.cpu().numpy() for each in (b.crow, b.col, b.weight))
-        rows.append(ViewRows(crow=arrays[0], col=arrays[1], weight=arrays[2], targets=targets, valid=valid))
+        crow, col, weight = b.crow.cpu().numpy(), b.col.cpu().numpy(), b.weight.cpu().numpy()
+        rows.append(ViewRows(crow=crow, col=col, weight=weight, targets=targets, valid=valid))
     return rows
 
 
@@ -179,249 +339,84 @@ def _standardize(vectors: np.ndarray, outputs: OutputSpace) -> np.ndarray:
     return outputs.standardize(coordinates).reshape(*vectors.shape[:-1], outputs.channels)
 
 
-CHUNK_ROWS = 16_384
-"""Rows of targets that are compared with the codebook in one matrix product."""
-MAX_CLUSTERS = 128
-"""Largest number of target classes of a dense teacher."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ClassBalance:
-    """A codebook of target classes, in standard units, and their numbers of Gaussians in the dataset."""
-
-    codebook: Float32[np.ndarray, "C channels"]
-    counts: Float64[np.ndarray, " C"]
-
-    def class_weights(self, power: float) -> Float32[np.ndarray, " C"]:
-        """The weight n^−power of each class, scaled so that its mean over the targets of the dataset is 1. Classes
-        without Gaussians, to which cells across an edge may be nearest, get that of the most frequent class."""
-        counts = np.where(self.counts > 0, self.counts, max(float(self.counts.max()), 1.0))
-        weights = counts**-power
-        weights *= self.counts.sum() / max(float((weights * self.counts).sum()), 1e-30)
-        return weights.astype(np.float32)
-
-    def target_weights(self, targets: Float32[np.ndarray, "n channels"], power: float) -> Float32[np.ndarray, " n"]:
-        """The weight of each target's class; with the power 0 all are 1, and classes are not looked up."""
-        if power == 0:
-            return np.ones(len(targets), np.float32)
-        return self.class_weights(power)[nearest_codes(self.codebook, targets)]
-
-
-def nearest_codes(
-    codebook: Float32[np.ndarray, "C channels"], targets: Float32[np.ndarray, "n channels"]
-) -> Int64[np.ndarray, " n"]:
-    """The class of each target: the row of the nearest vector of the codebook."""
-    half = 0.5 * np.square(codebook, dtype=np.float64).sum(axis=1).astype(np.float32)
-    codes = [
-        (targets[start : start + CHUNK_ROWS] @ codebook.T - half).argmax(axis=1)
-        for start in range(0, len(targets), CHUNK_ROWS)
-    ]
-    return np.concatenate(codes) if codes else np.zeros(0, np.int64)
-
-
-def count_targets(
-    scenes: Iterable[Float32[np.ndarray, "_n channels"]], codebook: Float32[np.ndarray, "C channels"]
-) -> ClassBalance:
-    """Counts the classes of a dataset's targets, scene by scene."""
-    counts = np.zeros(len(codebook))
-    for targets in scenes:
-        counts += np.bincount(nearest_codes(codebook, targets), minlength=len(codebook))
-    return ClassBalance(codebook=codebook, counts=counts)
-
-
-def cluster_targets(sample: Float32[np.ndarray, "n channels"], *, seed: int = 0) -> Float32[np.ndarray, "C channels"]:
-    """A codebook for targets of a dense teacher: cluster centers of a sample of them."""
-    from sklearn.cluster import MiniBatchKMeans
-
-    subsample = sample[:: max(1, len(sample) // 4096)]
-    count = min(MAX_CLUSTERS, len(np.unique(subsample, axis=0)))
-    kmeans = MiniBatchKMeans(n_clusters=count, random_state=seed, batch_size=4096, n_init=3).fit(sample)
-    return np.asarray(kmeans.cluster_centers_, dtype=np.float32)
-
-
-SPACE_FILE, CLASS_BALANCE_FILE = "space.safetensors", "rarity.safetensors"
-CLUSTERED_TARGETS = 200_000
-"""Approximate number of targets, over all scenes, from which classes of a dense teacher are clustered."""
-
-
-class PreparedDataset:
-    """A folder of prepared scenes that share an output space, whose file holds what the preparation depends on.
-
-    The file of each scene is written atomically, so that an interrupted preparation can be continued, and several
-    processes can share the work.
-    """
-
-    def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
-        """Opens the folder, which is created with the space; `settings` are everything that the preparation depends on,
-        compared with those stored in it, and None = open an existing dataset with any settings."""
-        self.folder, path = folder, folder / SPACE_FILE
-        self.settings: dict[str, Any] = json.loads(json.dumps(settings, default=str)) if settings is not None else {}
-        with error_hint("give another folder as prepared="):
-            if not path.is_file():
-                if settings is None:
-                    raise InputError(f"{folder}: expected prepared scenes, found no {SPACE_FILE}")
-                with readable(folder):
-                    if folder.exists() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
-                        raise InputError(f"{folder}: holds something else than prepared scenes (no {SPACE_FILE})")
-                return
-            with open_archive(path) as file:
-                stored = file.value("made_with", dict)
-            if settings is not None and stored != self.settings:
-                raise InputError(f"{folder}: was prepared with {first_difference(stored, self.settings)}")
-            self.settings = stored
-
-    def fingerprint(self) -> str:
-        """A hash of the output space, by which a resumed training checks that its targets are the same."""
-        with readable(self.folder / SPACE_FILE):
-            return hashlib.sha256(read_foreign(self.folder / SPACE_FILE)).hexdigest()[:16]
-
-    def digest_of_scenes(self, names: Sequence[str]) -> str:
-        """A hash of the headers of prepared scenes, which hold the checksums of all arrays."""
-        digest = hashlib.sha256()
-        for name in names:
-            path = self.scene_path(name)
-            if path.is_file():
-                with open_archive(path) as file:
-                    digest.update(f"{name} {file.value('digest', str)}".encode())
-        return digest.hexdigest()[:16]
-
-    def load_kinds(self) -> tuple[str, ...]:
-        """Loads the names of the things that the teacher tells apart; none for a teacher without names."""
-        with error_hint("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
-            kinds = file.value("kinds", list)
-            if not all(isinstance(kind, str) for kind in kinds):
-                raise InputError("expected names as the kinds in the header")
-        return tuple(kinds)
-
-    def load_space(self) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
-        """Loads the output space, and for a coded teacher the vectors of its codes in standard units, else None."""
-        with error_hint("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
-            outputs = read_output_space(file)
-            codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
-        return outputs, codebook
-
-    @property
-    def precision(self) -> Precision:
-        """How the targets of its scenes are stored."""
-        return "int8" if dict(self.settings.get("prepare") or {}).get("targets") == "int8" else "float16"
-
-    def scene_path(self, name: str) -> Path:
-        """The path of a scene's file, which exists once the scene is prepared."""
-        return self.folder / "scenes" / f"{name}.safetensors"
-
-    def has_scene(self, source: Path) -> bool:
-        """Whether the scene at this path is prepared, from this path or from another one with the same files."""
-        path = self.scene_path(source.name)
-        if not path.is_file():
-            return False
-        with error_hint("remove the file to prepare the scene again"), open_archive(path) as file:
-            stored_source = file.value("source", str)
-            files = file.value("source_files", str)
-            if (got := stored_precision(file)) != self.precision:
-                raise InputError(f"expected targets of {self.precision}, as the settings of its folder say, got {got}")
-        # A data set that was moved, or is mounted elsewhere on another machine, holds the same files.
-        if stored_source != str(source.resolve()) and not (files and files == digest_of_files(source)):
-            raise InputError(
-                f"{path}: was prepared from {stored_source}, but this run uses {source.resolve()}; prepared scenes "
-                "need distinct names: rename one, or give another folder as prepared="
-            )
-        return True
-
-    def prepare(
-        self,
-        scene: Scene,
-        teacher: Teacher,
-        config: PrepareConfig,
-        *,
-        source: Path = Path(),
-        device: torch.device = torch.device("cpu"),
-    ) -> None:
-        """Prepares one scene, which was read from `source`, and writes its file atomically."""
-        outputs, _ = self.load_space()
-        path, maps = self.scene_path(scene.name), self.folder / f".maps.{scene.name}"
-        path.parent.mkdir(exist_ok=True)
-        maps.mkdir(exist_ok=True)
-        with locked(maps, wait=True):
-            if path.is_file():  # Another run has prepared the scene meanwhile.
-                return
-            try:
-                maps.mkdir(exist_ok=True)
-                for stale in maps.iterdir():
-                    stale.unlink()
-                prepare_scene(path, scene, CachedTeacher(teacher, maps), outputs, config, source=source, device=device)
-            finally:
-                shutil.rmtree(maps, ignore_errors=True)
-
-    def check_kinds(self, teacher: Teacher) -> None:
-        """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
-        were added since."""
-        if teacher.table is None:
+def add_scene(
+    dataset: PreparedDataset,
+    scene: Scene,
+    teacher: Teacher,
+    config: PrepareConfig,
+    *,
+    source: Path = Path(),
+    device: torch.device = torch.device("cpu"),
+) -> None:
+    """Prepares one scene, which was read from `source`, and writes its file atomically."""
+    outputs, _ = dataset.load_space()
+    path, maps = dataset.scene_path(scene.name), dataset.folder / f".maps.{scene.name}"
+    path.parent.mkdir(exist_ok=True)
+    maps.mkdir(exist_ok=True)
+    with locked(maps, wait=True):
+        if path.is_file():  # Another run has prepared the scene meanwhile.
             return
-        kinds = self.load_kinds()
-        new = [kind for kind in getattr(teacher, "kinds", ()) if kind not in kinds]
-        if kinds and new:
-            raise InputError(
-                f"{self.folder}: the classes of this dataset lack {listed(new, 3)}, since the scene has changed; give "
-                "another folder as prepared="
-            )
-
-    def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:
-        """Counts the target classes of the training scenes that are prepared, and stores the counts, unless those of
-        these scenes are stored already. All processes of a training call this; each counts its share of the scenes."""
-        codebook = None
-        with fail_together():
-            if process.is_first:
-                codebook = self._classes_to_count(names)
-        codebook = value_of_first(codebook)
-        if codebook is None:
-            return
-        scenes = self.scenes(names)
-        with fail_together():
-            share = track(scenes[process.rank :: process.world_size], "counting targets")
-            counts = count_targets((_seen_targets(scene) for scene in share), codebook).counts
-        with fail_together():
-            counts = summed_array(counts)
-            if process.is_first:
-                arrays = {"codebook": codebook, "counts": counts}
-                write_archive(self.folder / CLASS_BALANCE_FILE, arrays, {"scenes": [scene.name for scene in scenes]})
-
-    def _classes_to_count(self, names: Sequence[str]) -> Float32[np.ndarray, "C channels"] | None:
-        """The codebook of the classes; None if the targets of these scenes have been counted."""
-        scenes, path = self.scenes(names), self.folder / CLASS_BALANCE_FILE
-        if path.is_file():
-            with error_hint("remove the file to count targets again"), open_archive(path) as file:
-                if {scene.name for scene in scenes} <= set(file.value("scenes", list)):
-                    return None
-        _, codebook = self.load_space()
-        if codebook is None:
-            scene_share = max(1, CLUSTERED_TARGETS // len(scenes))
-            codebook = cluster_targets(np.concatenate([_seen_targets(scene, scene_share) for scene in scenes]))
-        return codebook
-
-    def load_class_balance(self) -> ClassBalance:
-        """Loads the target classes and their frequencies, as stored by `count_classes`."""
-        channels = self.load_space()[0].channels
-        path = self.folder / CLASS_BALANCE_FILE
-        with error_hint("remove the file to count targets again"), open_archive(path) as file:
-            codebook = file.array("codebook", "float32", ("C", channels))
-            counts = file.array("counts", "float64", ("C",))
-            if not len(counts) or not (counts >= 0).all():
-                raise InputError("expected one or more target classes with counts of 0 or more")
-            return ClassBalance(codebook=codebook, counts=counts)
-
-    def find_scene(self, name: str) -> PreparedScene | None:
-        """Opens a prepared scene by name; None if it is not prepared, for lack of what the teacher needs."""
-        path = self.scene_path(name)
-        return PreparedScene(path) if path.is_file() else None
-
-    def scenes(self, names: Sequence[str]) -> list[PreparedScene]:
-        """Opens prepared scenes by name; those that are not prepared are left out."""
-        return [scene for name in names if (scene := self.find_scene(name)) is not None]
+        try:
+            maps.mkdir(exist_ok=True)
+            for stale in maps.iterdir():
+                stale.unlink()
+            prepare_scene(path, scene, CachedTeacher(teacher, maps), outputs, config, source=source, device=device)
+        finally:
+            shutil.rmtree(maps, ignore_errors=True)
 
 
-def _seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
-    """The targets of the seen Gaussians of a scene, at most `max_targets` of them, evenly spaced; it is closed."""
-    rows = np.flatnonzero(scene.weights)
-    targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
-    scene.close()
-    return targets
+def teacher_of_heads(teachers: Mapping[str, TeacherConfig], heads: Sequence[str]) -> str:
+    """The name of the teacher that adapter heads belong to; the first teacher where none has heads."""
+    with_heads = [name for name, config in teachers.items() if config.has_heads]
+    if heads and len(with_heads) > 1:
+        raise InputError(
+            f"heads={','.join(heads)}: {' and '.join(with_heads)} have adapter heads; expected one such teacher"
+        )
+    return with_heads[0] if with_heads else next(iter(teachers))
+
+
+def required_heads(loss_heads: Sequence[str], teachers: Mapping[str, TeacherConfig]) -> tuple[str, ...]:
+    """The names of the heads that a training needs: of the render loss, and stored with the weights."""
+    stored = [name for config in teachers.values() for name in config.stored_heads]
+    return tuple(dict.fromkeys([*loss_heads, *stored]))
+
+
+def missing_heads(dataset: PreparedDataset, names: Sequence[str], teacher: TeacherConfig) -> list[Head]:
+    """The teacher's heads of some names that are not stored in a prepared dataset yet."""
+    path = dataset.folder / HEADS_FILE
+    stored = load_heads(path) if path.is_file() else None
+    if stored is not None and all(has_head(stored, name) for name in names):
+        return []
+    stored_names = stored.names if stored is not None else ()
+    return [head for head in teacher.read_heads(names) if head.name not in stored_names]
+
+
+def measure_dataset_heads(
+    dataset: PreparedDataset,
+    heads: Sequence[Head],
+    scenes: Sequence[Path],
+    open_scene: OpenScene,
+    views: int,
+    *,
+    optional: bool = False,
+) -> None:
+    """Measures the heads of `missing_heads` over the maps that the dataset's output space was computed from, and adds
+    them to its folder."""
+    if not heads:
+        return
+    path, outputs = dataset.folder / HEADS_FILE, dataset.load_space()[0]
+    stored = load_heads(path) if path.is_file() else HeadSet(space=outputs.space)
+    check_heads_space(stored.space, outputs.space)
+    sample = CellSample(views)
+    for _, of_scene, feature_map in sampled_maps(scenes, open_scene, views, optional=optional):
+        check_heads_space(of_scene.space, outputs.space)
+        sample.add(feature_map)
+    measured = measure_heads(heads, sample.vectors(), outputs.space, outputs.basis)
+    save_heads(path, HeadSet(space=outputs.space, heads=(*stored.heads, *measured.heads)))
+
+
+def dataset_heads(dataset: PreparedDataset, names: Sequence[str]) -> HeadSet:
+    """Heads of a prepared dataset, by name; none for no names."""
+    if not names:
+        return HeadSet(space=dataset.load_space()[0].space)
+    return choose_heads(load_heads(dataset.folder / HEADS_FILE), names)

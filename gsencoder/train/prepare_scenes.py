@@ -17,24 +17,29 @@ from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, error_prefix, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
-from gsencoder.core.settings import option
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.labels.files import read_split
+from gsencoder.data.orbits import CamerasOfSplat
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits, with_views
-from gsencoder.fusion.fit import with_fitting_splat
-from gsencoder.fusion.folder import TEACHER_NAME
 from gsencoder.models.output_space import check_distinct
-from gsencoder.teachers.base import MissingInput, Teacher
-from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_member, words_by_teacher
-from gsencoder.teachers.heads import Head
+from gsencoder.teachers.base import Head, MissingInput, Teacher
+from gsencoder.teachers.build import TeacherConfig, options_of_member, words_by_teacher
 from gsencoder.teachers.labels import LabelsConfig
+from gsencoder.text.table import TEACHER_NAME
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.distributed import check_agreement, fail_together
-from gsencoder.train.prepare import SPACE_FILE, PrepareConfig, PreparedDataset
-from gsencoder.train.space import fit_space, measure_dataset_heads, missing_heads, teacher_of_heads
+from gsencoder.train.prepare import (
+    PrepareConfig,
+    add_scene,
+    fit_space,
+    measure_dataset_heads,
+    missing_heads,
+    teacher_of_heads,
+)
+from gsencoder.train.prepared import SPACE_FILE, PreparedDataset
 from gsencoder.types import Scene
 
 TRAINED = "trained on"
@@ -50,7 +55,7 @@ class SourceConfig:
         "file of the Gaussians of scenes with views, where {scene} stands for the name of its folder; "
         f"empty = make seeds. {READABLE}",
     )
-    orbits: int = option(24, "largest number of cameras placed in a splat without views")
+    orbits: int = option(24, "largest number of cameras placed in a splat without views", ge=1, le=10_000)
     cameras: CamerasOfSplat = option(
         "auto", "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"
     )
@@ -69,7 +74,7 @@ class SourceConfig:
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
 
     def __post_init__(self) -> None:
-        check_orbits(self.orbits)
+        check_limits(self)
         wrong = [name for name in self.teachers if not re.fullmatch(TEACHER_NAME, name)]
         if wrong:
             raise InputError(f"teachers: expected names of letters, digits, _ and -, got {wrong[0]!r}")
@@ -109,7 +114,7 @@ class SceneReader:
         config = self.config.teachers_by_name[name]
         teacher = None if config.per_scene else self._shared.get(name)
         if teacher is None:
-            teacher = self._shared[name] = build_teacher(config, scene, self.words.get(name))
+            teacher = self._shared[name] = config.build(scene, self.words.get(name))
         # Known before Gaussians are made, which takes minutes where they come from photographs.
         if teacher.needs_images and scene.views is not None and scene.views.images is None:
             raise MissingInput(f"teacher {name}: the scene has no pictures")
@@ -142,8 +147,13 @@ class SceneReader:
         """A scene with views, as it is on disk; cameras are placed in a splat without any."""
         config = self.config
         scene = load_scene(path, splat=config.splat or None, options=config.data)
-        scene = with_fitting_splat(scene, config.splat, config.data)
+        if config.splat:
+            from gsencoder.fusion.fit import with_fitting_splat
+
+            scene = with_fitting_splat(scene, config.splat, config.data)
         if scene.views is None:
+            from gsencoder.fusion.cameras import with_views
+
             scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)[0]
         return scene
 
@@ -299,7 +309,7 @@ def _prepare_scene(
                 datasets[name].check_kinds(teacher)
             try:
                 with config.typed_options(name):
-                    datasets[name].prepare(scene, teacher, config.prepare, source=path, device=device)
+                    add_scene(datasets[name], scene, teacher, config.prepare, source=path, device=device)
             except MissingInput:
                 if not optional:
                     raise
@@ -310,7 +320,9 @@ def _check_teachers(
 ) -> None:
     """Checks that each scene has a teacher and each teacher a scene, and warns of scenes that lack teachers."""
     every = [path.name for path in [*training, *held_out]]
-    present = {name: {scene.name for scene in dataset.scenes(every)} for name, dataset in datasets.items()}
+    present = {
+        name: [each for each in every if dataset.scene_path(each).is_file()] for name, dataset in datasets.items()
+    }
     without = [name for name in every if not any(name in scenes for scenes in present.values())]
     if without:
         raise InputError(f"teachers: {len(without)} scenes have none of them, such as {without[0]!r}; leave these out")

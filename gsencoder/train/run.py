@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
-from torch import Tensor, nn
+from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import plain
 from gsencoder.core.process import Device, ProcessRank, Track, untracked
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import option
 from gsencoder.core.threads import threads_of_torch
 from gsencoder.fusion.measured_heads import heads_digest
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
@@ -31,81 +30,18 @@ from gsencoder.train.loop import (
     ValidationResult,
     check_same_teachers,
 )
-from gsencoder.train.losses import TERMS, Heads, LossConfig, LossInputs
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.losses import TERMS, Distillation, Heads, LossConfig, TeacherRecipe, render_heads
+from gsencoder.train.prepare import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
-from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.prepared import PreparedDataset, PreparedScene
 from gsencoder.train.samples import (
     Augmentation,
-    Batch,
     SampleDataset,
     SampleRecipe,
     SamplingConfig,
-    TeacherRecipe,
     TrainingScene,
     join_samples,
 )
-from gsencoder.train.space import dataset_heads, render_heads, required_heads, teacher_of_heads
-
-
-class Distillation:
-    """The loss L = Σ_teachers w · Σ_terms λ_term · L_term over the terms of `losses.TERMS`, as totals before division.
-
-    In a step each term is Σ total / Σ weight over all micro-batches of all processes. The weights are known before
-    anything is computed, so each micro-batch divides its totals by the sum of the step's weights, and gradients are
-    simply added. A term of one of several teachers is called TEACHER/TERM, such as "labels/field".
-    """
-
-    advice = "loss.min_alpha, loss.min_kept and loss.rarity"
-
-    def __init__(
-        self,
-        network: nn.Module,
-        config: LossConfig,
-        teachers: Sequence[TeacherRecipe],
-        *,
-        heads: Mapping[str, Heads] = {},
-        device: torch.device = torch.device("cpu"),
-    ) -> None:
-        """The `network` is a `GaussianEncoder`, possibly wrapped for several processes; teachers are in the order of
-        its output columns, and adapter heads by teacher."""
-        self.network, self.config = network, config
-        self._widths = [teacher.channels for teacher in teachers]
-        self._codebooks = [torch.from_numpy(each.class_balance.codebook).to(device) for each in teachers]
-        self._heads = [
-            [(head.to(device), decode.to(device)) for head, decode in heads.get(each.name, ())] for each in teachers
-        ]
-        self._terms = [
-            (name if len(teachers) == 1 else f"{teacher.name}/{name}", weight * teacher.weight, number, TERMS[name])
-            for number, teacher in enumerate(teachers)
-            for name, weight in config.lambdas.items()
-            if weight * teacher.weight and (teacher.classes or not TERMS[name].classes)
-        ]
-
-    @property
-    def lambdas(self) -> dict[str, float]:
-        """The weights of the terms that are not 0, by name."""
-        return {name: weight for name, weight, _, _ in self._terms}
-
-    def divisors(self, batch: Batch) -> dict[str, float]:
-        """The sum of the weights of a batch's Gaussians or rows, for each term."""
-        return {
-            name: float(term.weights(batch.teachers[number]).double().sum()) for name, _, number, term in self._terms
-        }
-
-    def __call__(self, batch: Batch) -> dict[str, Tensor]:
-        """Totals of the terms whose weight is not 0, for the encoder's predictions."""
-        return self.terms(self.network(batch.attributes, batch.opacities, batch.plan), batch)
-
-    def terms(self, predicted: Float[Tensor, "N C"], batch: Batch) -> dict[str, Tensor]:
-        """Totals of the terms whose weight is not 0; the terms of a teacher that the batch's scenes lack are 0."""
-        with torch.autocast(predicted.device.type, enabled=False):
-            columns = predicted.split(self._widths, dim=1)
-            inputs = [
-                LossInputs(*each, self.config)
-                for each in zip(columns, batch.teachers, self._codebooks, self._heads, strict=True)
-            ]
-            return {name: term.total(inputs[number]) for name, _, number, term in self._terms}
 
 
 def encoder_trainer(
@@ -163,7 +99,6 @@ class TrainConfig(SourceConfig):
 
     def __post_init__(self) -> None:
         SourceConfig.__post_init__(self)
-        check_limits(self)
         if self.loss.confidence and not (self.prepare.center and self.prepare.scale):
             raise InputError(
                 "loss.confidence: weights by distances from the mean in typical ones; give loss.confidence=false with "
@@ -264,12 +199,12 @@ def fit(
     """Trains an encoder on prepared scenes; the arguments are those of `train`."""
     # Samples are numbered by scene, so that the order in which scenes are given must not matter to a resumed run.
     training = sorted(path.name for path in scenes)
-    outputs = OutputSpaces(by_teacher={name: dataset.load_space()[0] for name, dataset in datasets.items()})
     with_heads = teacher_of_heads(config.teachers_by_name, config.heads)
     heads = dataset_heads(datasets[with_heads], config.heads)
     if len(heads.heads) < len(config.heads):
         raise InputError(f"heads: {', '.join(config.heads)} names a head twice; its loss would count twice")
-    check_agreement("the heads of L_render", heads_digest(heads))
+    digest_of_heads = heads_digest(heads)
+    check_agreement("the heads of L_render", digest_of_heads)
     recipe = SampleRecipe(
         encoder=config.model,
         sampling=config.sampling,
@@ -279,7 +214,8 @@ def fit(
         seed=config.train.seed,
         step_samples=config.train.samples_per_step(process.world_size),
     )
-    score_encoder: Callable[[GaussianEncoder], ValidationResult] = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
+    outputs = OutputSpaces(by_teacher={name: dataset.load_space()[0] for name, dataset in datasets.items()})
+    score_encoder: Callable[[GaussianEncoder], ValidationResult] | None = None
     if validate is not None and held_out:
         held_out_parts = [_parts(datasets, path.name) for path in held_out]
         others = [TrainingScene(parts) for parts in held_out_parts if any(part is not None for part in parts)]
@@ -296,7 +232,7 @@ def fit(
         config.loss,
         config.train,
         folder=work,
-        settings=resume_settings(config, datasets, training, heads_digest(heads)),
+        settings=resume_settings(config, datasets, training, digest_of_heads),
         heads={with_heads: render_heads(heads, outputs[with_heads])},
         process=process,
         device=device,
@@ -304,10 +240,12 @@ def fit(
         validate=score_encoder,
     )
     state = trainer.run(track)
-    # A run that is resumed after its last step and validation has not validated in this process.
-    last = trainer.last_validation or score_encoder(encoder)
+    scores: Mapping[str, float] = {}
+    if score_encoder is not None:
+        # A run that is resumed after its last step and validation has not validated in this process.
+        scores = (trainer.last_validation or score_encoder(encoder)).scores
     tables = {name: _table_of(each, datasets[name]) for name, each in words.items()}
-    return Training(encoder=encoder, outputs=outputs, tables=tables, state=state, scores=dict(last.scores))
+    return Training(encoder=encoder, outputs=outputs, tables=tables, state=state, scores=dict(scores))
 
 
 def teacher_recipes(datasets: Mapping[str, PreparedDataset], losses: LossConfig) -> tuple[TeacherRecipe, ...]:

@@ -21,10 +21,9 @@ from torch.utils.data import Dataset
 from gsencoder.core.errors import InputError, error_prefix
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
-from gsencoder.models.plan import CloudPlan, Plan, join_plans
-from gsencoder.train.losses import TERMS, LossConfig, RenderRows, TeacherTargets
-from gsencoder.train.prepare import ClassBalance, nearest_codes
-from gsencoder.train.prepared_file import PreparedScene, ViewRows
+from gsencoder.models.plan import CloudPlan, join_plans
+from gsencoder.train.losses import TERMS, Batch, LossConfig, RenderRows, TeacherRecipe, TeacherTargets
+from gsencoder.train.prepared import ClassBalance, PreparedScene, ViewRows, nearest_codes
 from gsencoder.types import SH_C0, Cameras, Gaussians
 from gsencoder.types.checks import perpendicular
 
@@ -325,17 +324,6 @@ class Sample(NamedTuple):
     teachers: tuple[TeacherTargets, ...]
 
 
-class Batch(NamedTuple):
-    """A batch of samples, concatenated along Gaussians, tokens and rows; `names` are scene and views of each sample,
-    for messages. In scenes that lack a teacher its targets have no weight."""
-
-    names: tuple[str, ...]
-    attributes: Float[Tensor, "N A"]
-    opacities: Float[Tensor, " N"]
-    plan: Plan
-    teachers: tuple[TeacherTargets, ...]
-
-
 def join_samples(samples: Sequence[Sample], patch: int) -> Batch:
     """Joins samples to a batch; `patch` is the largest number of tokens in a patch of the encoder."""
     sizes = [len(sample.attributes) for sample in samples]
@@ -391,22 +379,6 @@ class TrainingScene:
 MAX_OPEN_FILES = 256
 """Largest number of files of prepared scenes, one for each teacher, that a process keeps open; those of the scene that
 was used least recently are closed first."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TeacherRecipe:
-    """A teacher of a training: the weight of its losses, and whether its targets have classes that a term of the loss
-    may compare. The columns of the codebook are the teacher's columns of the encoder's outputs."""
-
-    name: str
-    class_balance: ClassBalance
-    weight: float = 1.0
-    classes: bool = True
-
-    @property
-    def channels(self) -> int:
-        """Columns of its targets."""
-        return self.class_balance.codebook.shape[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -116,7 +116,7 @@ def test_work_ahead_comes_in_order_and_one_item_before_it_is_asked_for() -> None
 @pytest.mark.parametrize(("threads", "workers", "share"), [(4, 2, 2), (2, 2, 1), (1, 3, 1)])
 def test_workers_ahead_share_the_threads_and_give_results_in_order(threads, workers, share, monkeypatch):
     monkeypatch.setattr("gsencoder.core.threads.thread_count", lambda: threads)
-    together = threading.Barrier(workers)
+    together = threading.Barrier(min(workers, threads))
 
     def work(item: int) -> tuple[int, set[int]]:
         # Nobody passes before all workers are here.

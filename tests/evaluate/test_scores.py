@@ -16,7 +16,7 @@ from gsencoder.evaluate.benchmarks.localization import (
     scores,
     scores_by_name,
 )
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import field_error
 from gsencoder.types import Box, FeatureBasis, FeatureSpace, GaussianFeatures, Localization, Scene, SceneObject
 
 SPACE = FeatureSpace(name="s", channels=4)

@@ -8,8 +8,7 @@ from training_scenes import SPACE as SIDES
 from training_scenes import TABLE, DenseSideTeacher, SideTeacher, scene
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
-from gsencoder.fusion.errors import ProjectionSums, project_maps
+from gsencoder.fusion.basis import Moments, ProjectionSums, fit_basis, project_maps, table_basis, to_coordinates
 from gsencoder.render import blend
 from gsencoder.types import FeatureBasis, FeatureSpace
 

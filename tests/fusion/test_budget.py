@@ -10,8 +10,8 @@ from fixed_teachers import SPACE, CodedTeacher, FixedTeacher, make_scene
 from splats import one_gaussian
 
 from gsencoder.core.errors import InputError
+from gsencoder.fusion.basis import field_error, judge
 from gsencoder.fusion.budget import BudgetFusion, FusionBudget, check_budget, exact_config, fuse_within
-from gsencoder.fusion.errors import field_error, judge
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig
 from gsencoder.types import Cameras, FeatureMap, Scene, Views

@@ -12,7 +12,7 @@ from gsencoder.fusion.budget import bisection_order, map_at_rays, mean_turn
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.lift import VisibilityConfig, coverage_order, covering_views, keep_visible, sample_view
 from gsencoder.render import BlendConfig, blend
-from gsencoder.render.rays import strided_lattice
+from gsencoder.render.blend_cpu import strided_lattice
 
 OPEN = VisibilityConfig(against=())
 

@@ -12,8 +12,7 @@ from torch import nn
 
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.errors import CellSample
-from gsencoder.fusion.folder import copy_heads, find_heads
+from gsencoder.fusion.basis import CellSample
 from gsencoder.fusion.measured_heads import (
     HeadSet,
     MeasuredHead,
@@ -28,7 +27,8 @@ from gsencoder.fusion.measured_heads import (
     measure_heads,
     save_heads,
 )
-from gsencoder.teachers.heads import Head, Residual
+from gsencoder.models.output_space import copy_heads, find_heads
+from gsencoder.teachers.base import Head, Residual
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
 
 SPACE = FeatureSpace(name="radio", channels=6, teacher="radio", weights="abcd", preprocessing="resized")

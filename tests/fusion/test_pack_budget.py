@@ -12,7 +12,7 @@ from feature_fields import make_features
 from splats import front_camera, random_gaussians
 
 from gsencoder.app import main as cli
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.package import PACKAGE_FILE
 from gsencoder.memory import index as index_budget

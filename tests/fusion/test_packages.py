@@ -19,9 +19,9 @@ from gsencoder.app import main as cli
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat, save_splat
-from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
-from gsencoder.text.table import make_text_table, save_text_table
+from gsencoder.text.table import WORDS_FILE, make_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene, Views
 
 N = 600

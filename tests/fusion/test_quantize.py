@@ -9,7 +9,7 @@ from sklearn.cluster import KMeans
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion import quantize as module
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.quantize import BitAllocation, CompactFeatures, compact
 
 

@@ -11,10 +11,9 @@ from symbolic import symbolic_sizes
 
 from gsencoder.app import main as cli
 from gsencoder.infer.torch_network import TorchNetwork
-from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, save_weights
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.transformer import TransformerConfig
-from gsencoder.models.weights import save_weights
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace
 

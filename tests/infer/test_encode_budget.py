@@ -12,7 +12,7 @@ from splats import random_gaussians
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.folder import features_bytes, load_features, save_features
 from gsencoder.infer import encode as encode_module
 from gsencoder.infer import encode_budget as module

@@ -30,7 +30,8 @@ from gsencoder.infer.onnx.export import (
 )
 from gsencoder.infer.onnx.runtime import OnnxNetwork
 from gsencoder.infer.torch_network import TorchNetwork
-from gsencoder.models.neighbors import convolve_reference, neighbor_table
+from gsencoder.models.plan import neighbor_table
+from gsencoder.models.transformer import convolve_reference
 
 pytestmark = pytest.mark.slow
 

@@ -14,10 +14,9 @@ from gsencoder.infer import encode as module
 from gsencoder.infer.encode import Cloud, EncodeConfig, Encoder, check_cosines, check_parity
 from gsencoder.infer.onnx.export import export_onnx, random_cloud
 from gsencoder.infer.onnx.runtime import OnnxNetwork
-from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, save_weights
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.transformer import TransformerConfig
-from gsencoder.models.weights import save_weights
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians
 

@@ -12,12 +12,12 @@ from splats import random_gaussians
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import load_splat, save_splat
-from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package
 from gsencoder.memory import index as index_module
 from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.memory.reduction import CoverReduction
-from gsencoder.text.table import make_text_table, save_text_table
+from gsencoder.text.table import WORDS_FILE, make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
 

@@ -7,8 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsencoder.models import neighbors
-from gsencoder.models.neighbors import NeighborConv, convolve_reference, neighbor_table
+from gsencoder.models import transformer
+from gsencoder.models.plan import neighbor_table
+from gsencoder.models.transformer import NeighborConv, convolve_reference
 
 
 def distinct_cells(count: int, extent: int, seed: int = 0) -> torch.Tensor:
@@ -75,7 +76,7 @@ def test_on_a_full_grid_the_convolution_is_a_dense_one_with_zeros_around(size: i
 @pytest.mark.parametrize("count", [1, 5, 300])
 @pytest.mark.parametrize("block_rows", [64, 8192])
 def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(size, count, block_rows, monkeypatch):
-    monkeypatch.setattr(neighbors, "CPU_BLOCK_ROWS", block_rows)
+    monkeypatch.setattr(transformer, "CPU_BLOCK_ROWS", block_rows)
     table = neighbor_table(distinct_cells(count, 8), size)  # type: ignore[arg-type]
     layer = NeighborConv(3, 5, size).double()  # type: ignore[arg-type]
     x = torch.randn(len(table), 3, dtype=torch.float64, requires_grad=True)
@@ -91,17 +92,17 @@ def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(size,
 @pytest.mark.parametrize("line", [False, True])
 def test_cells_that_no_token_of_a_block_needs_are_left_out_and_nothing_but_rounding_changes(line, monkeypatch):
     """Isolated tokens, or a line of them, after a block of neighbors."""
-    monkeypatch.setattr(neighbors, "CPU_BLOCK_ROWS", 64)
+    monkeypatch.setattr(transformer, "CPU_BLOCK_ROWS", 64)
     dense = torch.cartesian_prod(*[torch.arange(4)] * 3)
     apart = torch.arange(100, 200)[:, None] * torch.tensor([1 if line else 3, 0, 0])
     table, widths = neighbor_table(torch.cat((dense, apart))), []
-    plain_gather = neighbors._gather_neighborhoods
+    plain_gather = transformer._gather_neighborhoods
 
     def gather(padded: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
         widths.append(cells.shape[1])
         return plain_gather(padded, cells)
 
-    monkeypatch.setattr(neighbors, "_gather_neighborhoods", gather)
+    monkeypatch.setattr(transformer, "_gather_neighborhoods", gather)
     layer, x = NeighborConv(3, 5).double(), torch.randn(len(table), 3, dtype=torch.float64)
     plain = convolve_reference(x, table, layer.weight) + layer.bias
     torch.testing.assert_close(layer(x, table), plain, rtol=1e-12, atol=1e-12)

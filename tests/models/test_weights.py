@@ -12,9 +12,8 @@ from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError
 from gsencoder.infer.encode import Encoder
-from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.encoder import GaussianEncoder, load_weights, save_weights
 from gsencoder.models.output_space import DEFAULT_WEIGHTS, SHIPPED_WEIGHTS, OutputSpace, OutputSpaces, find_weights
-from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=6, teacher="labels", text_encoder="t")

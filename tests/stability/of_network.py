@@ -13,9 +13,15 @@ from stability.registry import routine, worst
 from gsencoder.core.arrays import round_columns
 from gsencoder.models.encoder import MIN_MERGE_WEIGHT, EncoderConfig, GaussianEncoder, encoder_inputs, merge
 from gsencoder.models.grid import coordinate_bits, hilbert_from_morton, morton_codes
-from gsencoder.models.neighbors import NeighborConv, neighbor_table
-from gsencoder.models.plan import grid_coords, join_plans, plan_cloud
-from gsencoder.models.transformer import ATTRIBUTE_CHANNELS, PatchAttention, Pool, TransformerConfig, embed
+from gsencoder.models.plan import grid_coords, join_plans, neighbor_table, plan_cloud
+from gsencoder.models.transformer import (
+    ATTRIBUTE_CHANNELS,
+    NeighborConv,
+    PatchAttention,
+    Pool,
+    TransformerConfig,
+    embed,
+)
 from gsencoder.types import SH_C0
 
 Wide = oracles.Wide

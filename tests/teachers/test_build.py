@@ -18,7 +18,6 @@ from gsencoder.teachers.build import (
     SENTENCES,
     AutoConfig,
     TeacherConfig,
-    build_teacher,
     choose_teacher,
     text_table_of,
     words_of,
@@ -138,7 +137,7 @@ def test_a_joint_model_needs_a_tower_of_its_width(tmp_path: Path) -> None:
     config = OnnxConfig(model=str(save_colors(tmp_path / "net.onnx")), layout="grid", patch=4, joint=True)
     vocabulary = words_of(config, OnnxTextConfig(model=str(tmp_path), pooling="mean"))
     with pytest.raises(InputError, match="its features have 3 channels and its words 6"):
-        build_teacher(config, Scene(name="s"), vocabulary)
+        config.build(Scene(name="s"), vocabulary)
 
 
 def test_classes_without_a_name_are_refused_and_doubled_ones_counted() -> None:

@@ -15,8 +15,7 @@ from splats import front_camera
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
-from gsencoder.teachers.build import load_teacher_heads
-from gsencoder.teachers.heads import Head, text_kind
+from gsencoder.teachers.base import Head, text_kind
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig, RadioTeacher, read_radio_heads
 from gsencoder.types import Views
@@ -211,13 +210,13 @@ def test_pickles_are_refused_as_files_and_in_folders(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message):
             RadioTeacher(RadioConfig(model=str(model)))
         with pytest.raises(InputError, match=message):
-            load_teacher_heads(RadioConfig(model=str(model)), ["siglip"])
+            RadioConfig(model=str(model)).read_heads(["siglip"])
 
 
 def test_heads_of_a_teacher_without_any_are_refused() -> None:
     with pytest.raises(InputError, match="heads=siglip: teacher=palette has no adapter heads; teacher=radio has some"):
-        load_teacher_heads(PaletteConfig(), ["siglip"])
-    assert load_teacher_heads(PaletteConfig(), []) == []
+        PaletteConfig().read_heads(["siglip"])
+    assert PaletteConfig().read_heads([]) == []
 
 
 def test_the_backbone_of_a_release_is_loaded_without_its_code_and_without_warnings(folder: Path) -> None:

@@ -16,7 +16,6 @@ from torch.nn.functional import interpolate
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import fuse
-from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.masks import (
     Proposal,
     SamMasks,
@@ -256,7 +255,7 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
     config = RegionsConfig(
         masks="sam", vector="map", sam=str(folder), points=3, min_iou=0.0, min_stability=0.0, device="cpu", **options
     )
-    teacher = build_teacher(config, scene, None)
+    teacher = config.build(scene, None)
     made = teacher.feature_map(scene.views, 0)
     options = SamOptions(points=3, min_iou=0.0, min_stability=0.0, max_overlap=0.5)
     masks = SamMasks(str(folder), options, "cpu")
@@ -268,7 +267,7 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
     assert teacher.settings()["masks"] == "sam"
     for change in ({"points": 4}, {"min_iou": 0.1}, {"min_stability": 0.1}, {"max_overlap": 0.6}):
         assert SamMasks(str(folder), replace(options, **change), "cpu").settings() != masks.settings()
-    empty = build_teacher(replace(config, min_iou=1.0), scene, None)
+    empty = replace(config, min_iou=1.0).build(scene, None)
     with pytest.raises(InputError, match="none of 2 views"):
         fuse(scene, empty)
     bare = region_scene(images=None).views

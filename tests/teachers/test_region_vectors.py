@@ -33,7 +33,7 @@ from vision_towers import VISION as TOWER_VISION
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.build import words_of
 from gsencoder.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.teachers.regions import (
     MapVectors,
@@ -238,10 +238,10 @@ def test_models_without_a_pooled_output_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"gave 'out' of shape \[1, 3, 8, 8\], expected a pooled"):
         build(masks, save_colors(tmp_path / "net.onnx"), "crop")
     with pytest.raises(InputError, match="teacher.model= is missing: the image tower of vector=map"):
-        build_teacher(RegionsConfig(folder=str(masks), vector="map"), region_scene(), None)
+        RegionsConfig(folder=str(masks), vector="map").build(region_scene(), None)
     config = RegionsConfig(folder=str(masks), vector="crop", model=str(save_pool(tmp_path / "p.onnx")))
     with pytest.raises(InputError, match="no pictures to make vectors of regions from"):
-        build_teacher(config, region_scene(images=None), None)
+        config.build(region_scene(images=None), None)
 
 
 def test_a_text_tower_needs_a_joint_model(tmp_path: Path) -> None:

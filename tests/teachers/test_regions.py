@@ -27,7 +27,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.images import read_integers
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.teachers.base import MissingInput, Teacher
-from gsencoder.teachers.build import build_teacher, stored_words, text_table_of, words_of
+from gsencoder.teachers.build import stored_words, text_table_of, words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.teachers.masks import label_paths
 from gsencoder.teachers.regions import OnnxRegionOptions, RegionsConfig, read_captions
@@ -75,8 +75,8 @@ def test_instances_with_the_names_of_objects_are_what_the_labels_teacher_gives()
         objects=(scene_object(1, "mug"), scene_object(7, "lamp"), scene_object(9, None), scene_object(33, "table")),
     )
     with pytest.warns(SceneWarning, match="1 of 5 regions in 2 views have no caption"):
-        regions = build_teacher(RegionsConfig(masks="instances"), scene, WORDS)
-    labels = build_teacher(LabelsConfig(), scene, WORDS)
+        regions = RegionsConfig(masks="instances").build(scene, WORDS)
+    labels = LabelsConfig().build(scene, WORDS)
     for view in range(2):
         np.testing.assert_array_equal(rows_of(regions, scene, view), rows_of(labels, scene, view))
     ours, theirs = (fuse(scene, teacher, FuseConfig()).features for teacher in (regions, labels))
@@ -88,7 +88,7 @@ def test_instances_with_the_names_of_objects_are_what_the_labels_teacher_gives()
 def test_instances_may_have_captions_of_a_file(tmp_path: Path) -> None:
     scene = region_scene(tmp_path, instances=[labels_of(view).astype(np.int32) for view in range(2)])
     (tmp_path / "names.json").write_text(json.dumps(CAPTIONS))
-    teacher = build_teacher(RegionsConfig(masks="instances", captions="names.json", rest="none"), scene, WORDS)
+    teacher = RegionsConfig(masks="instances", captions="names.json", rest="none").build(scene, WORDS)
     np.testing.assert_allclose(rows_of(teacher, scene, 0), expected(0, CAPTIONS, np.full(8, np.nan)), atol=1e-6)
 
 
@@ -103,7 +103,7 @@ def test_the_words_beside_the_features_hold_the_captions(tmp_path: Path) -> None
     assert isinstance(words, OpenVocabulary)
     captions = {"1": "red mug on a table", "7": "table", "9": "lamp"}
     (tmp_path / "masks/captions.json").write_text(json.dumps(captions))
-    teacher = build_teacher(config, region_scene(), words)
+    teacher = config.build(region_scene(), words)
     table = stored_words(teacher, words)
     assert table.find("red mug on a table") is not None
     np.testing.assert_allclose(table.encode(["red mug on a table"]), words.encode(["red mug on a table"]), atol=1e-6)
@@ -126,15 +126,15 @@ def test_masks_are_looked_for_in_the_scenes_folder_first(tmp_path: Path, monkeyp
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     scene, config = region_scene(tmp_path / "scene"), RegionsConfig(folder="masks")
-    build_teacher(config, scene, WORDS)
+    config.build(scene, WORDS)
     shutil.copytree(tmp_path / "scene/masks", tmp_path / "here/masks")
     with pytest.raises(InputError, match=r"teacher.folder=masks: stands for .*scene/masks and for .*here/masks"):
-        build_teacher(config, scene, WORDS)
+        config.build(scene, WORDS)
     shutil.rmtree(tmp_path / "scene/masks")
-    build_teacher(config, scene, WORDS)
+    config.build(scene, WORDS)
     shutil.rmtree(tmp_path / "here/masks")
     with pytest.raises(MissingInput, match="teacher.folder: nothing at .*scene/masks or masks"):
-        build_teacher(config, scene, WORDS)
+        config.build(scene, WORDS)
 
 
 def test_label_images_are_called_like_their_views(tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_settings_follow_masks_and_captions(tmp_path: Path) -> None:
     assert captioned_teacher(scene, masks).settings() != first
     maps = [labels_of(view).astype(np.int32) for view in (0, 1)]
     options = RegionsConfig(masks="instances", captions=str(tmp_path / "captions.json"))
-    one, other = (build_teacher(options, region_scene(instances=m), WORDS).settings() for m in (maps, maps[::-1]))
+    one, other = (options.build(region_scene(instances=m), WORDS).settings() for m in (maps, maps[::-1]))
     assert one != other
 
 
@@ -210,7 +210,7 @@ def test_a_scene_lacks_what_is_named_relative_to_it_and_an_absolute_path_without
         ({"folder": "masks", "captions": str(tmp_path / "none.json")}, False),
     ):
         with pytest.raises(InputError, match="nothing at .*none") as error:
-            build_teacher(RegionsConfig(**options), scene, WORDS)  # type: ignore[arg-type]
+            RegionsConfig(**options).build(scene, WORDS)  # type: ignore[arg-type]
         assert isinstance(error.value, MissingInput) == lacks
 
 
@@ -255,14 +255,14 @@ def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="captions need words: give a text tower"):
         captioned_teacher(scene, masks, words=None)
     with pytest.raises(InputError, match="teacher.folder= is missing"):
-        build_teacher(RegionsConfig(), scene, WORDS)
+        RegionsConfig().build(scene, WORDS)
     (masks / "captions.json").unlink()
     with pytest.raises(InputError, match=r"captions.json: no such file; vector=captions needs captions"):
         captioned_teacher(scene, masks, None)
     with pytest.raises(MissingInput, match="masks=instances: the scene has no instance maps"):
-        build_teacher(instances, scene, WORDS)
+        instances.build(scene, WORDS)
     with pytest.raises(InputError, match="no object of the scene has a name"):
-        build_teacher(instances, region_scene(instances=[labels_of(0).astype(np.int32)] * 2), WORDS)
+        instances.build(region_scene(instances=[labels_of(0).astype(np.int32)] * 2), WORDS)
     with pytest.raises(InputError, match="the scene has no views"):
         captioned_teacher(replace(scene, views=None), masks)
     for name in "ab":

@@ -16,7 +16,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.checkpoint import read_map, write_map
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.teachers import segmenter
-from gsencoder.teachers.build import build_teacher, stored_words, words_of
+from gsencoder.teachers.build import stored_words, words_of
 from gsencoder.teachers.labels import COLOR_NAMES, LabelsConfig, PaletteConfig
 from gsencoder.teachers.segmenter import (
     OnnxSegmenterOptions,
@@ -138,7 +138,7 @@ def test_words_beside_labels_hold_the_names_of_all_objects(tmp_path: Path) -> No
         for row, name in enumerate(("abacus", "zebra crossing"))
     )
     scene = Scene(name="s", objects=objects)
-    teacher = build_teacher(LabelsConfig(), scene, vocabulary)
+    teacher = LabelsConfig().build(scene, vocabulary)
     beside = stored_words(teacher, vocabulary)
     assert beside.find("other") is None
     for name in ("abacus", "zebra crossing"):
@@ -150,9 +150,9 @@ def test_a_segmenter_needs_a_model_words_and_pictures(tmp_path: Path, rng: np.ra
     save_graph(tmp_path / "net.onnx")
     config = SegmenterConfig(model=str(tmp_path / "net.onnx"))
     with pytest.raises(InputError, match="its classes need words"):
-        build_teacher(config, Scene(name="s"), None)
+        config.build(Scene(name="s"), None)
     with pytest.raises(InputError, match="teacher.model= is missing"):
-        build_teacher(SegmenterConfig(), Scene(name="s"), words(rng))
+        SegmenterConfig().build(Scene(name="s"), words(rng))
 
 
 def test_words_are_those_of_a_table_or_of_the_colors_or_none(tmp_path: Path, rng: np.random.Generator) -> None:

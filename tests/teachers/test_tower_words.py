@@ -20,7 +20,7 @@ from gsencoder.app.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features
-from gsencoder.teachers.build import TeacherConfig, build_teacher, words_of
+from gsencoder.teachers.build import TeacherConfig, words_of
 from gsencoder.teachers.tower import TransformersConfig
 from gsencoder.text import vocabulary as open_vocabulary
 from gsencoder.text.models import TransformersTextConfig
@@ -58,7 +58,7 @@ def save_joint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SaveJoint:
 
 
 def built(teacher: TeacherConfig, text: TextConfig) -> Any:
-    return build_teacher(teacher, Scene(name="s"), words_of(teacher, text))
+    return teacher.build(Scene(name="s"), words_of(teacher, text))
 
 
 @pytest.mark.parametrize("kind", ["clip", "siglip"])
@@ -68,7 +68,7 @@ def test_one_folder_gives_both_sides_of_a_joint_space(save_joint: SaveJoint, kin
     text = TransformersTextConfig(model=folder)
     config = TransformersConfig(model=folder, dense=dense)
     words = words_of(config, text)
-    teacher = build_teacher(config, Scene(name="s"), words)
+    teacher = config.build(Scene(name="s"), words)
     assert teacher.space.text_encoder == words.space.text_encoder
     assert teacher.space.channels == words.space.channels
 
@@ -83,7 +83,7 @@ def test_a_summary_of_a_picture_of_one_patch_is_the_pictures_own(save_joint: Sav
     model = transformers.SiglipModel.from_pretrained(folder).eval()
     patch = vision_towers.picture(8, 8)
     config = TransformersConfig(model=str(folder), dense="summary", size=8, device="cpu")
-    teacher = build_teacher(config, Scene(name="s"), None)
+    teacher = config.build(Scene(name="s"), None)
     made = teacher.feature_map(Views(cameras=front_camera(8, 8), names=("a",), images=[patch]), 0).features
     pixels = torch.from_numpy(patch.astype(np.float32)).permute(2, 0, 1)[None] / 127.5 - 1
     with torch.inference_mode():
@@ -166,7 +166,7 @@ def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str,
     assert (config.dense, config.size) == (dense, size)
     config = replace(config, size=vision_towers.SIDE)
     views = Views(cameras=front_camera(30, 20), names=("a",), images=[vision_towers.picture(20, 30)])
-    features = build_teacher(config, Scene(name="s"), None).feature_map(views, 0).features
+    features = config.build(Scene(name="s"), None).feature_map(views, 0).features
     assert features.shape[:2] == (3, 4)
 
 

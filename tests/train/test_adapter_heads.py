@@ -11,25 +11,22 @@ from textured_box import box_cameras
 from torch import nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.errors import CellSample
-from gsencoder.fusion.folder import HEADS_FILE
+from gsencoder.fusion.basis import CellSample
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, load_heads, save_heads
-from gsencoder.models.output_space import OutputSpace
-from gsencoder.teachers.base import MissingInput
-from gsencoder.teachers.heads import Head
+from gsencoder.models.output_space import HEADS_FILE, OutputSpace
+from gsencoder.teachers.base import Head, MissingInput
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.space import (
-    FeatureDecoder,
+from gsencoder.train.losses import FeatureDecoder, render_heads
+from gsencoder.train.prepare import (
     dataset_heads,
     measure_dataset_heads,
     missing_heads,
-    render_heads,
     required_heads,
     sampled_maps,
     teacher_of_heads,
 )
+from gsencoder.train.prepared import PreparedDataset
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Views
 
 SPACE = FeatureSpace(name="s", channels=6)
@@ -150,7 +147,7 @@ def of_teacher(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     def read(teacher: Any, names: Any) -> list[Head]:
         return [heads[name] for name in names]
 
-    monkeypatch.setattr("gsencoder.train.space.load_teacher_heads", read)
+    monkeypatch.setattr(RadioConfig, "read_heads", read)
     return read
 
 

@@ -19,7 +19,7 @@ from gsencoder.train.distributed import (
     gpu_index,
     join_processes,
 )
-from gsencoder.train.prepare import CLASS_BALANCE_FILE, PreparedDataset
+from gsencoder.train.prepared import CLASS_BALANCE_FILE, PreparedDataset
 from gsencoder.train.samples import TrainingScene
 
 SLURM_TASK = {"SLURM_STEP_ID": "0", "SLURM_NTASKS": "8", "SLURM_LOCALID": "1", "SLURM_STEP_NODELIST": "gpu[03-04]"}
@@ -109,7 +109,7 @@ from pathlib import Path
 from test_distributed import counted, scores_of
 
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared import PreparedDataset
 
 if __name__ == "__main__":
     with join_processes("cpu") as (process, _):

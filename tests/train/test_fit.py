@@ -15,15 +15,14 @@ from training_scenes import LOSSES, SMALL, SideTeacher, prepared
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import ProcessRank
-from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, save_heads
-from gsencoder.models.output_space import OutputSpaces
-from gsencoder.teachers.heads import Head
+from gsencoder.models.output_space import HEADS_FILE, OutputSpaces
+from gsencoder.teachers.base import Head
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train import run
 from gsencoder.train.loop import ValidationResult
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared import PreparedDataset
 from gsencoder.train.run import TrainConfig, fit
 from gsencoder.train.samples import SampleDataset
 

@@ -27,21 +27,19 @@ from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.onnx import OnnxConfig
 from gsencoder.train import prepare_scenes as prepare_module
 from gsencoder.train.memory import prepare_memory
-from gsencoder.train.prepare import (
+from gsencoder.train.prepare import PrepareConfig, add_scene, dataset_space, fit_space, prepare_scene, sampled_maps
+from gsencoder.train.prepare_scenes import SceneReader, SourceConfig, prepare_scenes, split_scenes
+from gsencoder.train.prepared import (
     CLASS_BALANCE_FILE,
     SPACE_FILE,
     ClassBalance,
-    PrepareConfig,
     PreparedDataset,
+    PreparedScene,
     cluster_targets,
     count_targets,
     nearest_codes,
-    prepare_scene,
 )
-from gsencoder.train.prepare_scenes import SceneReader, SourceConfig, prepare_scenes, split_scenes
-from gsencoder.train.prepared_file import PreparedScene
 from gsencoder.train.samples import SamplingConfig
-from gsencoder.train.space import dataset_space, fit_space, sampled_maps
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
 
@@ -114,7 +112,7 @@ def test_a_scene_that_was_moved_is_recognized_by_its_files(tmp_path: Path) -> No
     for name, size in {"poses.txt": 5, "color/0.jpg": 9}.items():
         (source / name).write_bytes(bytes(size))
     dataset.scene_path("wall_0").unlink()
-    dataset.prepare(scene(0), SideTeacher(), PREPARE, source=source)
+    add_scene(dataset, scene(0), SideTeacher(), PREPARE, source=source)
     moved = Path(shutil.move(source, tmp_path / "elsewhere" / "wall_0"))
     assert dataset.has_scene(moved)
     (moved / "color" / "0.jpg").write_bytes(bytes(10))
@@ -181,7 +179,7 @@ def test_maps_of_a_killed_run_are_neither_used_nor_left(tmp_path: Path) -> None:
     maps = tmp_path / f".maps.{names[0]}"
     maps.mkdir()
     (maps / "map_00000.safetensors").write_bytes(b"of another scene")
-    dataset.prepare(scene(0), DenseSideTeacher(), PREPARE, source=Path(names[0]))
+    add_scene(dataset, scene(0), DenseSideTeacher(), PREPARE, source=Path(names[0]))
     assert path.read_bytes() == before
     assert not maps.exists()
 

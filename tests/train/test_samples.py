@@ -21,10 +21,8 @@ from gsencoder.geometry import covariances
 from gsencoder.render import BlendConfig, blend
 from gsencoder.train import samples as module
 from gsencoder.train.loop import ErrorsAsValues, join_unless_error, micro_batches
-from gsencoder.train.losses import AdapterHead, LossConfig, render_loss
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepared_file import PreparedScene, ViewRows
-from gsencoder.train.run import Distillation
+from gsencoder.train.losses import AdapterHead, Distillation, LossConfig, render_loss
+from gsencoder.train.prepared import PreparedDataset, PreparedScene, ViewRows
 from gsencoder.train.samples import (
     Augmentation,
     SampleDataset,

@@ -25,11 +25,12 @@ from gsencoder.train.loop import (
     load_checkpoint,
     save_checkpoint,
 )
-from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.losses import Distillation
+from gsencoder.train.prepare import add_scene, dataset_space
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
-from gsencoder.train.run import Distillation, TrainConfig, encoder_trainer, resume_settings, train
+from gsencoder.train.prepared import PreparedDataset
+from gsencoder.train.run import TrainConfig, encoder_trainer, resume_settings, train
 from gsencoder.train.samples import SampleDataset, TrainingScene
-from gsencoder.train.space import dataset_space
 
 
 def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alone(datasets: Datasets) -> None:
@@ -184,7 +185,7 @@ def test_classes_are_counted_again_when_a_scene_gains_the_teacher(tmp_path: Path
     before = dataset.load_class_balance().counts.sum()
     dataset.count_classes(names, untracked)
     assert dataset.load_class_balance().counts.sum() == before
-    dataset.prepare(scene(2), SideTeacher(), PREPARE, source=Path("wall_2"))
+    add_scene(dataset, scene(2), SideTeacher(), PREPARE, source=Path("wall_2"))
     dataset.count_classes([*names, "wall_2"], untracked)
     assert dataset.load_class_balance().counts.sum() > 1.3 * before
 
@@ -194,7 +195,7 @@ def test_files_of_other_gaussians_are_refused(datasets: Datasets, tmp_path: Path
     moved = scene(0)
     other.scene_path("wall_0").unlink()
     shifted = replace(moved, gaussians=replace(moved.gaussians, means=moved.gaussians.means + np.float32(1e-3)))
-    other.prepare(shifted, HeightTeacher(), PREPARE, source=Path("wall_0"))
+    add_scene(other, shifted, HeightTeacher(), PREPARE, source=Path("wall_0"))
     first = datasets["sides"][0].find_scene("wall_0")
     with pytest.raises(InputError, match="has other Gaussians or views than"):
         TrainingScene([first, other.find_scene("wall_0")]).check_consistent()

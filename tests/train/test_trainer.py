@@ -38,7 +38,7 @@ from gsencoder.train.loop import (
     silence_connection_errors,
 )
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.run import encoder_trainer
 
 pytestmark = pytest.mark.slow

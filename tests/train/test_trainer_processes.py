@@ -31,8 +31,8 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.prepared import PreparedDataset
+from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.run import encoder_trainer
 
 if __name__ == "__main__":

@@ -19,9 +19,9 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.evaluate.validation import validate_names
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.folder import load_features
-from gsencoder.models.weights import load_weights
+from gsencoder.models.encoder import load_weights
 from gsencoder.text.table import load_text_table
 from gsencoder.train import TrainConfig, train
 

@@ -14,7 +14,7 @@ from gsencoder.core.files import write_json
 from gsencoder.core.process import Clock
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, distinct_paths, kind_of_path
-from gsencoder.fusion.folder import holds_features, table_path
+from gsencoder.fusion.folder import holds_features
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question, Task, check_question
 from gsencoder.infer.ask.batch import (
     ANSWER,
@@ -37,6 +37,7 @@ from gsencoder.infer.ask.questions import (
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
 from gsencoder.infer.localize import LocalizeConfig, localize, select_features
 from gsencoder.infer.views.targets import ViewsConfig, best_boxes
+from gsencoder.text.table import table_path
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.types import Scene
 

@@ -21,7 +21,7 @@ from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import color_words, make_room, write_room
 from gsencoder.evaluate.benchmarks.localization import aabb_iou
-from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.infer.draw import write_boxes_ply
 from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
@@ -30,7 +30,7 @@ from gsencoder.infer.page.report import HtmlReport
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import text_table_of
 from gsencoder.teachers.labels import LabelsTeacher, PaletteConfig, PaletteTeacher
-from gsencoder.text.table import TextTable, make_text_table, save_text_table
+from gsencoder.text.table import WORDS_FILE, TextTable, make_text_table, save_text_table
 from gsencoder.types import Localization, Scene, SceneObject
 
 PAGE = "page.html"

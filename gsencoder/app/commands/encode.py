@@ -23,15 +23,7 @@ from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
 from gsencoder.data.up import with_up
 from gsencoder.fusion.basis import basis_figures, describe_basis
-from gsencoder.fusion.folder import (
-    FEATURES_FILE,
-    HEADS_FILE,
-    copy_heads,
-    file_of_teacher,
-    find_heads,
-    save_features,
-    save_tables,
-)
+from gsencoder.fusion.folder import FEATURES_FILE, save_features
 from gsencoder.infer.encode import EncodeConfig, Encoder, file_of_encoder, load_encoder
 from gsencoder.infer.encode_budget import (
     BudgetEncoding,
@@ -41,7 +33,8 @@ from gsencoder.infer.encode_budget import (
     exact_encoding,
     realised_error,
 )
-from gsencoder.models.output_space import teacher_of_space
+from gsencoder.models.output_space import HEADS_FILE, copy_heads, find_heads, teacher_of_space
+from gsencoder.text.table import file_of_teacher, save_tables
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
 
 
@@ -227,8 +220,9 @@ def _basis_figures(
 def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Encoder, count: int) -> dict[str, float]:
     """How well the encoder's basis represents its teacher's maps of some of a scene's views."""
     # Teachers need torch, which encoding with an exported graph does without.
-    from gsencoder.fusion.errors import project_maps
-    from gsencoder.teachers.build import build_teacher, words_by_teacher
+    from gsencoder.fusion.basis import project_maps
+    from gsencoder.fusion.checkpoint import upright
+    from gsencoder.teachers.build import words_by_teacher
     from gsencoder.train.prepare_scenes import SourceConfig
 
     if scene.views is None:
@@ -240,5 +234,5 @@ def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Enc
     source = from_dict(SourceConfig, stored)
     teachers = source.teachers_by_name
     only = next(iter(teachers)) if len(teachers) == 1 else name
-    teacher = build_teacher(teachers[only], scene, words_by_teacher(teachers, source.text).get(only))
+    teacher = upright(teachers[only].build(scene, words_by_teacher(teachers, source.text).get(only)))
     return project_maps(basis, teacher, scene.views, even_indices(len(scene.views), count).tolist()).fit().figures()

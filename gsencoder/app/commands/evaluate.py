@@ -43,12 +43,13 @@ from gsencoder.evaluate.sources import (
     space_of_words,
 )
 from gsencoder.fusion.fit import with_fitting_splat
-from gsencoder.fusion.folder import find_heads, load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.measured_heads import find_head, load_heads
 from gsencoder.infer.encode import EncodeConfig, file_of_encoder, load_encoder
 from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.teachers.build import TeacherConfig, load_teacher_heads, words_of
+from gsencoder.models.output_space import find_heads
+from gsencoder.teachers.build import TeacherConfig, words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, with_training_names, words_of_table
 from gsencoder.train.distributed import fail_together, join_processes, value_of_first, values_of_all
@@ -198,7 +199,7 @@ def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     """Outputs of an adapter head, and the words that they are compared with."""
     table = getattr(config.teacher, "words", "") if isinstance(config.text, TableTextConfig) else ""
     if not config.weights:
-        (measured_head,) = load_teacher_heads(config.teacher, [config.head], "head")
+        (measured_head,) = config.teacher.read_heads([config.head], "head")
         words = words_of_head(measured_head, table, config.text)
         return fused_head_source(config.teacher, measured_head, words.space.text_encoder, config.fusion), words
     path = find_heads(file_of_encoder(config.weights))

@@ -15,12 +15,12 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.folder import copy_heads, find_heads, heads_of_graph, load_memories
+from gsencoder.fusion.folder import load_memories
 from gsencoder.infer.encode import Cloud, Encoder, check_cosines, check_parity, file_of_encoder
 from gsencoder.infer.onnx.export import export_onnx, random_cloud
 from gsencoder.infer.onnx.runtime import SUFFIX
 from gsencoder.memory.attention import export_memory
-from gsencoder.models.output_space import teacher_of_space
+from gsencoder.models.output_space import copy_heads, find_heads, heads_of_graph, teacher_of_space
 from gsencoder.types import QueryMemory
 
 MAX_SIZE = 10_000_000

@@ -11,7 +11,6 @@ import numpy as np
 
 from gsencoder.app.inputs import load_fusable
 from gsencoder.app.options import SharedScenesConfig, settings
-from gsencoder.app.reports import report_fusion
 from gsencoder.app.run import Run
 from gsencoder.core.archive import LONGEST_SHARE
 from gsencoder.core.budget import MEGABYTE
@@ -19,10 +18,11 @@ from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Clock, Device
 from gsencoder.core.settings import option
+from gsencoder.data.orbits import CamerasOfSplat
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.basis import describe_basis
+from gsencoder.fusion.basis import describe_basis, project_maps, sample_cells
 from gsencoder.fusion.budget import (
     BudgetFusion,
     FusionBudget,
@@ -31,23 +31,18 @@ from gsencoder.fusion.budget import (
     fuse_within,
     realised_error,
 )
-from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits
-from gsencoder.fusion.errors import project_maps, sample_cells
-from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_features
+from gsencoder.fusion.folder import FEATURES_FILE, save_features
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
-from gsencoder.fusion.measured_heads import measure_heads, save_heads
-from gsencoder.models.output_space import OutputSpaces, load_output_spaces, name_of_space
+from gsencoder.models.output_space import HEADS_FILE, OutputSpaces, load_output_spaces, name_of_space
+from gsencoder.teachers.base import Head
 from gsencoder.teachers.build import (
     AutoConfig,
     TeacherConfig,
-    build_teacher,
     choose_teacher,
-    load_teacher_heads,
     stored_words,
     words_of,
 )
-from gsencoder.teachers.heads import Head
-from gsencoder.text.table import save_text_table
+from gsencoder.text.table import WORDS_FILE, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
 
@@ -64,7 +59,7 @@ class FuseCommandConfig(SharedScenesConfig):
         f"Gaussians of a scene with views, where {{scene}} stands for the name of its folder; "
         f"empty = seeds. {READABLE}",
     )
-    orbits: int = option(24, "largest number of cameras placed in a splat without views")
+    orbits: int = option(24, "largest number of cameras placed in a splat without views", ge=1, le=10_000)
     cameras: CamerasOfSplat = option(
         "auto", "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"
     )
@@ -88,19 +83,18 @@ class FuseCommandConfig(SharedScenesConfig):
 
     def __post_init__(self) -> None:
         SharedScenesConfig.__post_init__(self)
-        check_orbits(self.orbits)
         check_budget(self.budget, self.fusion, basis=bool(self.basis))
 
 
 def run(config: FuseCommandConfig, run: Run) -> None:
     """Fuses one scene into out=, or each of several into the folder OUT/NAME."""
-    choose_device(config.device)  # A missing device is an error before anything is read.
+    device = choose_device(config.device)  # A missing device is an error before anything is read.
     paths = find_scenes(config.paths)
     with run.step("teacher"):
         words_once, heads = cache(words_of), list[Head]()
         if config.teacher.name != "auto":
             words_once(config.teacher, config.text)  # What cannot be read is an error before any scene is.
-            heads = load_teacher_heads(config.teacher, config.teacher.stored_heads, "teacher.heads")
+            heads = config.teacher.read_heads(config.teacher.stored_heads, "teacher.heads")
     outputs = load_output_spaces(config.basis, "basis") if config.basis else None
 
     def one(path: Path, out: Path, run: Run) -> None:
@@ -119,14 +113,14 @@ def run(config: FuseCommandConfig, run: Run) -> None:
             )
             with run.step("teacher"):
                 chosen = choose_teacher(config.teacher, config.text, scene, words_once)
-                teacher = build_teacher(chosen.teacher, scene, chosen.words)
+                teacher = chosen.teacher.build(scene, chosen.words)
             if chosen.reason:
                 run.results.update(teacher=settings(chosen.teacher), text=settings(chosen.text))
                 run.print(f"{scene.name}: {chosen.reason}; {chosen.describe()}")
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             common: dict[str, Any] = {
                 "work": None if teacher.cheap else work,
-                "device": config.device,
+                "device": device,
                 "track": run.track,
             }
             budgeted: BudgetFusion | None = None
@@ -150,8 +144,11 @@ def run(config: FuseCommandConfig, run: Run) -> None:
             if basis is not None and scene.views is not None:
                 run.results.update(project_maps(basis, fusion.teacher, scene.views, fusion.views).fit().figures())
             lines = report_limits(folder, scene, budgeted, config, run) if budgeted is not None else []
-            lines += write_heads(folder, heads, scene, fusion, run)
+            if heads:
+                lines += write_heads(folder, heads, scene, fusion, run)
             if config.report:
+                from gsencoder.app.reports import report_fusion
+
                 with run.step("report"):
                     report_fusion(folder, scene, fusion.features, fusion.truncation, chosen.teacher.name, run)
         shutil.rmtree(work, ignore_errors=True)
@@ -196,25 +193,26 @@ def recipe(teacher: TeacherConfig, fusion: FuseConfig) -> dict[str, Any]:
 def add_figures(fusion: Fusion, run: Run) -> None:
     """Adds the figures of a fusion to the summary."""
     features = fusion.features
+    seen, space = features.seen, features.space.describe()
     run.results.update(
         gaussians=len(features),
-        seen=int(features.seen.sum()),
+        seen=int(seen.sum()),
         views=len(fusion.views),
         visibility=list(fusion.depth_sources),
         channels=features.space.channels,
         rank=features.features.shape[1],
         energy_kept=features.basis.energy_kept if features.basis is not None else 1.0,
         truncation=fusion.truncation,
-        median_weight=float(np.median(features.weights[features.seen])),
-        space=features.space.describe(),
+        median_weight=float(np.median(features.weights[seen])),
+        space=space,
         features="features.safetensors",
     )
 
 
 def write_heads(folder: Path, heads: Sequence[Head], scene: Scene, fusion: Fusion, run: Run) -> list[str]:
     """Measures adapter heads over the maps that were fused and writes them; returns a line for each head."""
-    if not heads:
-        return []
+    from gsencoder.fusion.measured_heads import measure_heads, save_heads
+
     assert scene.views is not None
     with run.step("heads"):
         sample = sample_cells(fusion.teacher, scene.views, fusion.views)

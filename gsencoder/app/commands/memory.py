@@ -20,12 +20,12 @@ from gsencoder.core.settings import option
 from gsencoder.data.scenes import find_scenes
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.evaluate.sources import RenderedErrors, RenderedTally
-from gsencoder.fusion.folder import MEMORY_FILE, file_of_teacher, save_memories, save_tables
+from gsencoder.fusion.folder import MEMORY_FILE, save_memories
 from gsencoder.infer.encode import EncodeConfig, load_encoder
 from gsencoder.memory.bank import BankConfig
 from gsencoder.models.output_space import check_distinct, name_of_space
-from gsencoder.teachers.build import build_teacher, stored_words, words_by_teacher
-from gsencoder.text.table import TextTable
+from gsencoder.teachers.build import stored_words, words_by_teacher
+from gsencoder.text.table import TextTable, file_of_teacher, save_tables
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.loop import TrainerConfig
 from gsencoder.train.memory import (
@@ -179,7 +179,7 @@ def _prepare(
     for name, teacher_config in config.teachers_by_name.items():
         with error_prefix(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
             with run.step("teacher"):
-                teacher = build_teacher(teacher_config, scene, words.get(name))
+                teacher = teacher_config.build(scene, words.get(name))
             spaces[name] = teacher.space
             check_distinct(spaces)
             with run.step("prepare"):

@@ -11,7 +11,7 @@ from gsencoder.core.archive import copy_checked
 from gsencoder.core.budget import MEGABYTE, reject_options_set_by_budget
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.settings import option
-from gsencoder.fusion.folder import HEADS_FILE, WORDS_FILE, copy_heads, load_features, table_path
+from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.package import (
     PACKAGE_FILE,
     Form,
@@ -25,7 +25,8 @@ from gsencoder.fusion.package import (
 )
 from gsencoder.infer.localize import select_features
 from gsencoder.memory.index import IndexConfig, index_features, index_within
-from gsencoder.text.table import load_text_table, save_text_table
+from gsencoder.models.output_space import HEADS_FILE, copy_heads
+from gsencoder.text.table import WORDS_FILE, load_text_table, save_text_table, table_path
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import GaussianFeatures, Scene
 

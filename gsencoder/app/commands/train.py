@@ -15,20 +15,17 @@ from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import find_scenes
-from gsencoder.evaluate.validation import validate_names
-from gsencoder.fusion.basis import basis_figures, describe_basis
-from gsencoder.fusion.errors import total_fit
-from gsencoder.fusion.folder import HEADS_FILE, save_tables
+from gsencoder.fusion.basis import basis_figures, describe_basis, total_fit
 from gsencoder.fusion.measured_heads import HeadSet, save_heads
-from gsencoder.infer.encode import EncodeConfig
-from gsencoder.models.output_space import WEIGHTS_FILE, OutputSpace
-from gsencoder.models.weights import save_weights
+from gsencoder.models.encoder import save_weights
+from gsencoder.models.output_space import HEADS_FILE, WEIGHTS_FILE, OutputSpace
+from gsencoder.text.table import save_tables
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, check_same_teachers
+from gsencoder.train.prepare import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.prepare_scenes import split_scenes
-from gsencoder.train.prepared_file import PreparedScene
-from gsencoder.train.run import TrainConfig, Training, fit, prepare
-from gsencoder.train.space import dataset_heads, required_heads, teacher_of_heads
+from gsencoder.train.prepared import PreparedScene
+from gsencoder.train.run import SceneValidator, TrainConfig, Training, fit, prepare
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +84,6 @@ def run(config: TrainCommandConfig, run: Run) -> None:
             return
         with fail_together():
             group.take(resume=config.resume)
-        encoding = EncodeConfig(precision=config.train.precision, device=config.device)
         with run.step("train"):
             result = fit(
                 datasets,
@@ -98,7 +94,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
                 work=group.work.path,
                 process=process,
                 device=device,
-                validate=partial(validate_names, config=encoding),
+                validate=validator(config) if held_out else None,
                 track=run.track,
             )
         if folder is None:
@@ -114,6 +110,14 @@ def run(config: TrainCommandConfig, run: Run) -> None:
         of = f" for {name}" if len(figures) > 1 else ""
         run.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
     run.print(*(f"{out}: {line}" for line in heads.describe()))
+
+
+def validator(config: TrainCommandConfig) -> SceneValidator:
+    """The accuracy of names, by an encoder that computes as the training does."""
+    from gsencoder.evaluate.validation import validate_names
+    from gsencoder.infer.encode import EncodeConfig
+
+    return partial(validate_names, config=EncodeConfig(precision=config.train.precision, device=config.device))
 
 
 def encoder_basis_figures(outputs: OutputSpace, held_out: Sequence[PreparedScene]) -> dict[str, int | float]:

@@ -13,7 +13,6 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.fusion.folder import check_heads_space
 from gsencoder.fusion.measured_heads import find_head, head_space, head_tokens
 from gsencoder.infer.localize import (
     LocalizeConfig,
@@ -37,6 +36,7 @@ from gsencoder.infer.views.pictures import (
     write_pictures,
 )
 from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, best_boxes, targets_of
+from gsencoder.models.output_space import check_heads_space
 from gsencoder.render import BlendConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Box, Scene

@@ -16,7 +16,7 @@ from jaxtyping import Float32, Int64
 from gsencoder.core.errors import InputError, counted
 from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult
 from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
-from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.fuse import fuse
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.types import GaussianFeatures, Scene

@@ -25,7 +25,7 @@ from gsencoder.evaluate.tradeoff.measure import interleaved, timed_run
 from gsencoder.evaluate.tradeoff.stages import EncoderSettings, Inputs, StageName, encoder_of, taught_scene
 from gsencoder.fusion.fuse import fuse
 from gsencoder.teachers.base import Teacher
-from gsencoder.teachers.build import build_teacher, text_table_of
+from gsencoder.teachers.build import text_table_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 from gsencoder.types.orientation import upright_views
@@ -144,7 +144,7 @@ def fusion_runs(path: Path, inputs: Inputs, points: int) -> Iterator[Runs]:
         coarse = inputs.teacher
         if isinstance(coarse, LabelsConfig) and coarse.cell == 1:
             coarse = replace(coarse, cell=DENSE_CELL)
-        source = build_teacher(coarse, scene, words)
+        source = coarse.build(scene, words)
         runs: Runs = {
             "gaussians": [(size, partial(fuse, part, teacher, fusion)) for size, part in gaussian_sizes(scene, points)],
             "views": [
@@ -164,9 +164,7 @@ def fusion_runs(path: Path, inputs: Inputs, points: int) -> Iterator[Runs]:
             cameras = smaller.views.cameras
             smaller = replace(smaller, gaussians=scene.gaussians, objects=scene.objects)
             pixels = float((cameras.widths.astype(np.float64) * cameras.heights).mean())
-            runs["pixels"].append(
-                (pixels, partial(fuse, smaller, build_teacher(inputs.teacher, smaller, words), fusion))
-            )
+            runs["pixels"].append((pixels, partial(fuse, smaller, inputs.teacher.build(smaller, words), fusion)))
         yield runs
 
 

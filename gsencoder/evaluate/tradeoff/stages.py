@@ -26,8 +26,8 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.evaluate.benchmarks.localization import Hit, LocalizationProtocol, queryable_objects, score_queries
 from gsencoder.evaluate.benchmarks.naming import compare_names
+from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.checkpoint import CachedTeacher
-from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import FEATURES_FILE, save_features
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.package import (
@@ -55,7 +55,7 @@ from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconst
 from gsencoder.render import BlendConfig
 from gsencoder.render.images import psnr, ssim, view_colors
 from gsencoder.render.rasterize import rasterize
-from gsencoder.teachers.build import TeacherConfig, build_teacher, text_table_of
+from gsencoder.teachers.build import TeacherConfig, text_table_of
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
@@ -160,7 +160,7 @@ def taught_scene(inputs: Inputs, path: Path, needs_words: str = "") -> Iterator[
     scene = load_scene(path, options=inputs.data)
     scene = with_gaussians(with_counted_views(scene) if words is not None else scene, inputs.seeds)
     with tempfile.TemporaryDirectory(prefix="gsencoder_maps_") as maps:
-        teacher = CachedTeacher(build_teacher(inputs.teacher, scene, words), Path(maps))
+        teacher = CachedTeacher(inputs.teacher.build(scene, words), Path(maps))
         yield TaughtScene(scene=scene, teacher=teacher, words=words, inputs=inputs)
 
 

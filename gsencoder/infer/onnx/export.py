@@ -29,8 +29,6 @@ from onnxscript import opset18 as traced
 from onnxscript import opset20 as op
 from onnxscript.values import OnnxFunction, Opset
 
-import gsencoder.models.neighbors
-import gsencoder.models.raw_encoder  # noqa: F401  these two define the operators that are translated
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
 from gsencoder.infer.onnx.runtime import (

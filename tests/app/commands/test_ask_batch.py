@@ -13,13 +13,13 @@ from asked_rooms import ORIGIN, ask, save_room
 from chat_server import Handler, answer, serving
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.folder import WORDS_FILE, load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.ask import ask as ask_module
 from gsencoder.infer.ask.ask import Asker, Question
 from gsencoder.infer.ask.questions import read_answers, read_questions
 from gsencoder.infer.views.pictures import view_pictures
 from gsencoder.infer.views.targets import ViewsConfig
-from gsencoder.text.table import load_text_table
+from gsencoder.text.table import WORDS_FILE, load_text_table
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("vlm_environment")]
 

@@ -11,10 +11,10 @@ from gsencoder.app import main as cli
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.errors import project_maps
+from gsencoder.fusion.basis import project_maps
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.onnx.export import random_cloud
-from gsencoder.models.weights import load_weights
+from gsencoder.models.encoder import load_weights
 from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
 
 pytestmark = pytest.mark.slow

@@ -16,11 +16,11 @@ from gsencoder.app import main as cli
 from gsencoder.app.commands.localize import LocalizeCommandConfig, memory_of, search_from_poses
 from gsencoder.app.scenes import MAX_QUERIES_BYTES, load_words, query_words
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features, save_memories
+from gsencoder.fusion.folder import load_features, save_features, save_memories
 from gsencoder.infer.from_pose import FromPoseConfig, from_pose
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.relevancy import ThresholdConfig
-from gsencoder.text.table import load_text_table, make_text_table, save_text_table
+from gsencoder.text.table import WORDS_FILE, load_text_table, make_text_table, save_text_table
 from gsencoder.text.vocabulary import closed_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory, Scene
 from gsencoder.types.checks import OPENCV_FROM_OPENGL

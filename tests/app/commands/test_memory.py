@@ -20,9 +20,8 @@ from gsencoder.core.logs import read_log
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features, load_memories, save_memories
-from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.encoder import GaussianEncoder, save_weights
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
-from gsencoder.models.weights import save_weights
 from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
 from gsencoder.train import memory as training
 from gsencoder.train.memory import fingerprint_of

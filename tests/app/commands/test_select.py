@@ -11,9 +11,9 @@ from selected_rooms import EMBEDDINGS, SPACE, read_labels, selected_room, words
 
 from gsencoder.app import main as cli
 from gsencoder.data.splats.files import load_splat
-from gsencoder.fusion.folder import WORDS_FILE, save_features, save_memories
+from gsencoder.fusion.folder import save_features, save_memories
 from gsencoder.infer.select import find_holes, sample_views, select
-from gsencoder.text.table import TextTable, make_text_table, save_text_table
+from gsencoder.text.table import WORDS_FILE, TextTable, make_text_table, save_text_table
 from gsencoder.types import MemoryBank, QueryMemory, Scene
 
 SCENE, KINDS = selected_room()

@@ -22,9 +22,10 @@ from viewed_rooms import STUB, name_features, read_container, room_scene, save_v
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands import view
-from gsencoder.fusion.folder import WORDS_FILE, save_features
+from gsencoder.fusion.folder import save_features
 from gsencoder.infer.page import page as bundle
 from gsencoder.infer.page.page import Container, jpeg_of
+from gsencoder.text.table import WORDS_FILE
 from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow

@@ -1,18 +1,23 @@
-"""The file of a prepared scene: Gaussians, their targets, and the rows of the render loss of every view.
+"""Prepared scenes on disk: Gaussians, their targets, and the rows of the render loss of every view; and their classes.
 
-The file is memory-mapped: a sample reads only its Gaussians and views, and data workers on one machine share the page
-cache. Data is verified against checksums when it is first read.
+A scene's file is memory-mapped: a sample reads only its Gaussians and views, and data workers on one machine share the
+page cache. Data is verified against checksums when it is first read.
+
+Loss weights are by class frequency, since a floor has 10⁵ Gaussians and a spoon has forty. The class of a target is the
+nearest vector of a codebook: the vectors of a coded teacher's table, or cluster centers of a dense teacher's features.
+A Gaussian of a class with n Gaussians in the dataset is weighted by n^−power.
 """
 
 import hashlib
+import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,11 +25,15 @@ from jaxtyping import Bool, Float, Float16, Float32, Float64, Int32, Int64
 
 from gsencoder.core.archive import Archive, MappedArrays, open_archive, write_archive
 from gsencoder.core.arrays import round_columns
-from gsencoder.core.errors import InputError, error_hint, error_prefix
+from gsencoder.core.errors import InputError, error_hint, error_prefix, listed, readable
+from gsencoder.core.files import read_foreign
+from gsencoder.core.process import ProcessRank, Track
+from gsencoder.core.settings import first_difference
 from gsencoder.data.scene_arrays import camera_arrays, read_cameras
-from gsencoder.fusion.errors import BINS, ProjectionSums
-from gsencoder.models.output_space import OutputSpace
-from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene
+from gsencoder.fusion.basis import BINS, ProjectionSums
+from gsencoder.models.output_space import OutputSpace, read_output_space
+from gsencoder.train.distributed import fail_together, summed_array, value_of_first
+from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene, Teacher
 
 Precision = Literal["float16", "int8"]
 """The types in which targets, and the teacher's vectors in the rows, can be stored."""
@@ -95,6 +104,13 @@ def write_prepared(
         raise InputError(f"prepare: targets of up to {largest:.3g} do not fit into float16; use prepare.scale=true")
     sizes = [len(view.valid) for view in views]
     entries = np.cumsum([0, *(len(view.col) for view in views)])
+    header = {
+        "source": "" if source is None else str(source.resolve()),
+        "source_files": "" if source is None else digest_of_files(source),
+        "views": list(scene.views.names),
+        "metres_per_unit": scene.metres_per_unit,
+        "up": None if scene.up is None else scene.up.tolist(),
+    }
     arrays = {
         "means": gaussians.means,
         "quats": gaussians.quats,
@@ -112,13 +128,6 @@ def write_prepared(
         **_stored_as("row_targets", np.concatenate(targets[1:]), precision),
         "row_valid": np.concatenate([view.valid for view in views]).astype(np.uint8),
         **camera_arrays(scene.views.cameras),
-    }
-    header = {
-        "source": "" if source is None else str(source.resolve()),
-        "source_files": "" if source is None else digest_of_files(source),
-        "views": list(scene.views.names),
-        "metres_per_unit": scene.metres_per_unit,
-        "up": None if scene.up is None else scene.up.tolist(),
     }
     if projections is not None:
         arrays |= {"cosines_of_projections": projections.histogram, "sums_of_projections": projections.sums}
@@ -190,8 +199,9 @@ class PreparedScene:
     @cached_property
     def _arrays(self) -> MappedArrays:
         with self._error_context():
-            arrays = MappedArrays(self.path, array_types(self.precision), self._closed)
-            check_arrays(arrays, len(self._header[0]))
+            types, views = array_types(self.precision), len(self.cameras)
+            arrays = MappedArrays(self.path, types, self._closed)
+            check_arrays(arrays, views)
         return arrays
 
     @cached_property
@@ -326,3 +336,227 @@ class PreparedScene:
             if not in_range.all() or not (view_rows.weight >= 0).all() or not np.isfinite(view_rows.targets).all():
                 raise InputError(f"view {self.view_names[view]!r}: its columns, weights or targets are out of range")
         return view_rows
+
+
+CHUNK_ROWS = 16_384
+"""Rows of targets that are compared with the codebook in one matrix product."""
+MAX_CLUSTERS = 128
+"""Largest number of target classes of a dense teacher."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ClassBalance:
+    """A codebook of target classes, in standard units, and their numbers of Gaussians in the dataset."""
+
+    codebook: Float32[np.ndarray, "C channels"]
+    counts: Float64[np.ndarray, " C"]
+
+    def class_weights(self, power: float) -> Float32[np.ndarray, " C"]:
+        """The weight n^−power of each class, scaled so that its mean over the targets of the dataset is 1. Classes
+        without Gaussians, to which cells across an edge may be nearest, get that of the most frequent class."""
+        counts = np.where(self.counts > 0, self.counts, max(float(self.counts.max()), 1.0))
+        weights = counts**-power
+        weights *= self.counts.sum() / max(float((weights * self.counts).sum()), 1e-30)
+        return weights.astype(np.float32)
+
+    def target_weights(self, targets: Float32[np.ndarray, "n channels"], power: float) -> Float32[np.ndarray, " n"]:
+        """The weight of each target's class; with the power 0 all are 1, and classes are not looked up."""
+        if power == 0:
+            return np.ones(len(targets), np.float32)
+        return self.class_weights(power)[nearest_codes(self.codebook, targets)]
+
+
+def nearest_codes(
+    codebook: Float32[np.ndarray, "C channels"], targets: Float32[np.ndarray, "n channels"]
+) -> Int64[np.ndarray, " n"]:
+    """The class of each target: the row of the nearest vector of the codebook."""
+    half = 0.5 * np.square(codebook, dtype=np.float64).sum(axis=1).astype(np.float32)
+    codes = [
+        (targets[start : start + CHUNK_ROWS] @ codebook.T - half).argmax(axis=1)
+        for start in range(0, len(targets), CHUNK_ROWS)
+    ]
+    return np.concatenate(codes) if codes else np.zeros(0, np.int64)
+
+
+def count_targets(
+    scenes: Iterable[Float32[np.ndarray, "_n channels"]], codebook: Float32[np.ndarray, "C channels"]
+) -> ClassBalance:
+    """Counts the classes of a dataset's targets, scene by scene."""
+    counts = np.zeros(len(codebook))
+    for targets in scenes:
+        counts += np.bincount(nearest_codes(codebook, targets), minlength=len(codebook))
+    return ClassBalance(codebook=codebook, counts=counts)
+
+
+def cluster_targets(sample: Float32[np.ndarray, "n channels"], *, seed: int = 0) -> Float32[np.ndarray, "C channels"]:
+    """A codebook for targets of a dense teacher: cluster centers of a sample of them."""
+    from sklearn.cluster import MiniBatchKMeans
+
+    subsample = sample[:: max(1, len(sample) // 4096)]
+    count = min(MAX_CLUSTERS, len(np.unique(subsample, axis=0)))
+    kmeans = MiniBatchKMeans(n_clusters=count, random_state=seed, batch_size=4096, n_init=3).fit(sample)
+    return np.asarray(kmeans.cluster_centers_, dtype=np.float32)
+
+
+SPACE_FILE, CLASS_BALANCE_FILE = "space.safetensors", "rarity.safetensors"
+CLUSTERED_TARGETS = 200_000
+"""Approximate number of targets, over all scenes, from which classes of a dense teacher are clustered."""
+
+
+class PreparedDataset:
+    """A folder of prepared scenes that share an output space, whose file holds what the preparation depends on.
+
+    The file of each scene is written atomically, so that an interrupted preparation can be continued, and several
+    processes can share the work.
+    """
+
+    def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
+        """Opens the folder, which is created with the space; `settings` are everything that the preparation depends on,
+        compared with those stored in it, and None = open an existing dataset with any settings."""
+        self.folder, path = folder, folder / SPACE_FILE
+        self.settings: dict[str, Any] = json.loads(json.dumps(settings, default=str)) if settings is not None else {}
+        with error_hint("give another folder as prepared="):
+            if not path.is_file():
+                if settings is None:
+                    raise InputError(f"{folder}: expected prepared scenes, found no {SPACE_FILE}")
+                with readable(folder):
+                    if folder.exists() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
+                        raise InputError(f"{folder}: holds something else than prepared scenes (no {SPACE_FILE})")
+                return
+            with open_archive(path) as file:
+                stored = file.value("made_with", dict)
+            if settings is not None and stored != self.settings:
+                raise InputError(f"{folder}: was prepared with {first_difference(stored, self.settings)}")
+            self.settings = stored
+
+    def fingerprint(self) -> str:
+        """A hash of the output space, by which a resumed training checks that its targets are the same."""
+        with readable(self.folder / SPACE_FILE):
+            return hashlib.sha256(read_foreign(self.folder / SPACE_FILE)).hexdigest()[:16]
+
+    def digest_of_scenes(self, names: Sequence[str]) -> str:
+        """A hash of the headers of prepared scenes, which hold the checksums of all arrays."""
+        digest = hashlib.sha256()
+        for name in names:
+            path = self.scene_path(name)
+            if path.is_file():
+                with open_archive(path) as file:
+                    digest.update(f"{name} {file.value('digest', str)}".encode())
+        return digest.hexdigest()[:16]
+
+    def load_kinds(self) -> tuple[str, ...]:
+        """Loads the names of the things that the teacher tells apart; none for a teacher without names."""
+        with error_hint("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
+            kinds = file.value("kinds", list)
+            if not all(isinstance(kind, str) for kind in kinds):
+                raise InputError("expected names as the kinds in the header")
+        return tuple(kinds)
+
+    def load_space(self) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
+        """Loads the output space, and for a coded teacher the vectors of its codes in standard units, else None."""
+        with error_hint("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
+            outputs = read_output_space(file)
+            codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
+        return outputs, codebook
+
+    @property
+    def precision(self) -> Precision:
+        """How the targets of its scenes are stored."""
+        return "int8" if dict(self.settings.get("prepare") or {}).get("targets") == "int8" else "float16"
+
+    def scene_path(self, name: str) -> Path:
+        """The path of a scene's file, which exists once the scene is prepared."""
+        return self.folder / "scenes" / f"{name}.safetensors"
+
+    def has_scene(self, source: Path) -> bool:
+        """Whether the scene at this path is prepared, from this path or from another one with the same files."""
+        path = self.scene_path(source.name)
+        if not path.is_file():
+            return False
+        with error_hint("remove the file to prepare the scene again"), open_archive(path) as file:
+            stored_source = file.value("source", str)
+            files = file.value("source_files", str)
+            if (got := stored_precision(file)) != self.precision:
+                raise InputError(f"expected targets of {self.precision}, as the settings of its folder say, got {got}")
+        # A data set that was moved, or is mounted elsewhere on another machine, holds the same files.
+        if stored_source != str(source.resolve()) and not (files and files == digest_of_files(source)):
+            raise InputError(
+                f"{path}: was prepared from {stored_source}, but this run uses {source.resolve()}; prepared scenes "
+                "need distinct names: rename one, or give another folder as prepared="
+            )
+        return True
+
+    def check_kinds(self, teacher: Teacher) -> None:
+        """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
+        were added since."""
+        if teacher.table is None:
+            return
+        kinds = self.load_kinds()
+        new = [kind for kind in getattr(teacher, "kinds", ()) if kind not in kinds]
+        if kinds and new:
+            raise InputError(
+                f"{self.folder}: the classes of this dataset lack {listed(new, 3)}, since the scene has changed; give "
+                "another folder as prepared="
+            )
+
+    def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:
+        """Counts the target classes of the training scenes that are prepared, and stores the counts, unless those of
+        these scenes are stored already. All processes of a training call this; each counts its share of the scenes."""
+        codebook = None
+        with fail_together():
+            if process.is_first:
+                codebook = self._classes_to_count(names)
+        codebook = value_of_first(codebook)
+        if codebook is None:
+            return
+        scenes = self.scenes(names)
+        header = {"scenes": [scene.name for scene in scenes]}
+        with fail_together():
+            share = track(scenes[process.rank :: process.world_size], "counting targets")
+            counts = count_targets((_seen_targets(scene) for scene in share), codebook).counts
+        with fail_together():
+            counts = summed_array(counts)
+            if process.is_first:
+                arrays = {"codebook": codebook, "counts": counts}
+                write_archive(self.folder / CLASS_BALANCE_FILE, arrays, header)
+
+    def _classes_to_count(self, names: Sequence[str]) -> Float32[np.ndarray, "C channels"] | None:
+        """The codebook of the classes; None if the targets of these scenes have been counted."""
+        scenes, path = self.scenes(names), self.folder / CLASS_BALANCE_FILE
+        if path.is_file():
+            with error_hint("remove the file to count targets again"), open_archive(path) as file:
+                if {scene.name for scene in scenes} <= set(file.value("scenes", list)):
+                    return None
+        _, codebook = self.load_space()
+        if codebook is None:
+            scene_share = max(1, CLUSTERED_TARGETS // len(scenes))
+            codebook = cluster_targets(np.concatenate([_seen_targets(scene, scene_share) for scene in scenes]))
+        return codebook
+
+    def load_class_balance(self) -> ClassBalance:
+        """Loads the target classes and their frequencies, as stored by `count_classes`."""
+        channels = self.load_space()[0].channels
+        path = self.folder / CLASS_BALANCE_FILE
+        with error_hint("remove the file to count targets again"), open_archive(path) as file:
+            codebook = file.array("codebook", "float32", ("C", channels))
+            counts = file.array("counts", "float64", ("C",))
+            if not len(counts) or not (counts >= 0).all():
+                raise InputError("expected one or more target classes with counts of 0 or more")
+            return ClassBalance(codebook=codebook, counts=counts)
+
+    def find_scene(self, name: str) -> PreparedScene | None:
+        """Opens a prepared scene by name; None if it is not prepared, for lack of what the teacher needs."""
+        path = self.scene_path(name)
+        return PreparedScene(path) if path.is_file() else None
+
+    def scenes(self, names: Sequence[str]) -> list[PreparedScene]:
+        """Opens prepared scenes by name; those that are not prepared are left out."""
+        return [scene for name in names if (scene := self.find_scene(name)) is not None]
+
+
+def _seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
+    """The targets of the seen Gaussians of a scene, at most `max_targets` of them, evenly spaced; it is closed."""
+    rows = np.flatnonzero(scene.weights)
+    targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
+    scene.close()
+    return targets
