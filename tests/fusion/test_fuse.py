@@ -64,8 +64,7 @@ def test_the_number_of_threads_does_not_change_a_bit(teacher, rng, monkeypatch):
     results = []
     for threads in (1, 3, 9):
         # Wherever the machine has fewer cores.
-        for module in ("gsencoder.fusion.fuse", "gsencoder.core.threads"):
-            monkeypatch.setattr(sys.modules[module], "thread_count", lambda threads=threads: threads)
+        monkeypatch.setattr("gsencoder.core.threads.thread_count", lambda threads=threads: threads)
         results.append(fuse(scene, made, config))
     assert 0 < results[0].features.seen.sum() < len(results[0].features)
     for other in results[1:]:

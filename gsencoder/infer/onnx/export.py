@@ -215,7 +215,7 @@ def with_row(x: FLOAT, value: FLOAT) -> FLOAT:
 
 @script(OURS, default_opset=op)
 def convolve(x: FLOAT, neighbors: INT32, weight: FLOAT) -> FLOAT:
-    """As `gsencoder.models.neighbors.NeighborConv`."""
+    """As `gsencoder.models.transformer.NeighborConv`."""
     table = in_blocks(neighbors)
     padded = with_row(x, op.CastLike(0.0, x))
     columns = op.Gather(op.Shape(weight), op.Constant(value_ints=[2]))
