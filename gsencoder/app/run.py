@@ -177,23 +177,20 @@ class Run:
 
     def to_dict(self) -> dict[str, Any]:
         """The record as JSON values. `non_finite` lists the results that were not finite and are null."""
+        total, versions = time.perf_counter() - self.began, _versions()
+        peak, processors = peak_memory_mb(), available_cores()
         lost: list[str] = []
         results = plain(self.results, "results", lost)
-        total, versions = time.perf_counter() - self.began, _versions()
         record = {
             "command": self.command,
             "version": gsencoder.__version__,
             "settings": plain(self.settings, "settings", lost),
             "timings": {name: round(seconds, 4) for name, seconds in (*self.timings.items(), ("total", total))},
-            "peak_memory_mb": plain(round(peak_memory_mb(), 1)),
+            "peak_memory_mb": round(peak, 1),
             "warnings": list(self.warnings),
             "results": results,
             "versions": versions,
-            "platform": {
-                "system": platform.system(),
-                "machine": platform.machine(),
-                "processors": available_cores(),
-            },
+            "platform": {"system": platform.system(), "machine": platform.machine(), "processors": processors},
         }
         return record | ({"non_finite": lost} if lost else {})
 
@@ -290,8 +287,9 @@ class Run:
         """
         check_names(paths)
         if len(paths) == 1:
+            name = scene_name(paths[0])
             refuse_several(f"{paths[0]}", "start it once, or give several scenes, which processes share")
-            one(paths[0], self.out(scene_name(paths[0]), part), self)
+            one(paths[0], self.out(name, part), self)
             return
         first = int(len(paths) * ((getattr(self.config, "worker", 0) * GOLDEN) % 1))
         failures: dict[Path, str] = {}
