@@ -338,7 +338,7 @@ PIXELS = 100_000
 def sample_views(cameras: Cameras, views: int, pixels: int = PIXELS) -> list[tuple[int, int]]:
     """The rows of `views` views, evenly spaced, each with the step between its pixels, in both directions, that leaves
     about `pixels` of them."""
-    rows = even_indices(len(cameras), views) if views and len(cameras) else np.zeros(0, np.int64)
+    rows = even_indices(len(cameras), views)
     areas = cameras.widths[rows].astype(np.int64) * cameras.heights[rows]
     strides = np.maximum(1, np.ceil(np.sqrt(areas / pixels))).astype(np.int64)
     return list(zip(rows.tolist(), strides.tolist(), strict=True))

@@ -17,7 +17,6 @@ from gsencoder.core.files import csv_text, json_bytes, write_bytes
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.tradeoff.measure import Records
-from gsencoder.evaluate.tradeoff.plots import page, picture, to_json
 from gsencoder.evaluate.tradeoff.scaling import ScalingConfig, scaling
 from gsencoder.evaluate.tradeoff.stages import HIGHER_IS_BETTER, STAGES, Inputs, StageName, make_stage
 from gsencoder.evaluate.tradeoff.sweep import (
@@ -26,8 +25,11 @@ from gsencoder.evaluate.tradeoff.sweep import (
     StageResult,
     SweepConfig,
     check_sweep,
+    plot_page,
+    plot_picture,
     scene_row,
     sweep_stage,
+    to_json,
 )
 
 TABLE, SCENES, RESULTS, PAGE, PICTURE, EXPONENTS = (
@@ -99,8 +101,8 @@ def _write(folder: Path, results: Sequence[StageResult], exponents: Sequence[dic
     if exponents:
         write_bytes(folder / EXPONENTS, csv_text(exponents).encode())
     with run.step("plot"):
-        write_bytes(folder / PAGE, page(everything))
-        write_bytes(folder / PICTURE, picture(results))
+        write_bytes(folder / PAGE, plot_page(everything))
+        write_bytes(folder / PICTURE, plot_picture(results))
     run.results.update(
         settings=rows,
         matter={each.stage.name: list(each.matter) for each in results},

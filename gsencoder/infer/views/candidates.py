@@ -76,11 +76,11 @@ def patches(gaussians: Gaussians, edge: float) -> Patches:
     is cut along that axis into equal parts of an edge at most; those are kept whose middles lie in its ellipsoid."""
     most = CONSTANTS.max_patches_per_gaussian
     parts = _parts(gaussians, edge, most)
-    while parts.prod(axis=1).sum() > max(CONSTANTS.max_patches, len(gaussians)) and most > 1:
+    while parts.prod(axis=1).sum() > max(CONSTANTS.max_patches, len(parts)) and most > 1:
         most //= 2
         parts = _parts(gaussians, edge, most)
     large = np.flatnonzero(parts.prod(axis=1) > 1)
-    turn_of = np.zeros(len(gaussians), np.int64)
+    turn_of = np.zeros(len(parts), np.int64)
     turn_of[large] = np.arange(len(large))
     turns = rotmats_from_quats(torch.from_numpy(gaussians.quats[large]).double()).numpy()
     kinds, kind_of = np.unique(parts, axis=0, return_inverse=True)
