@@ -57,31 +57,20 @@ from gsencoder.core.errors import InputError, one_line
 
 T = TypeVar("T")
 Config = TypeVar("Config", bound=CommonConfig)
+HYDRA_KEY = re.compile(r"\+{0,2}hydra[./]")
+"""Settings of Hydra itself, with -m; + adds one, as `+hydra.launcher.additional_parameters.account=…`."""
+SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
+"""Form of the value of a text option that is swept, with -m."""
 
 
-def store_settings(command: str, cls: type[CommonConfig]) -> None:
-    """Stores the defaults of a command and the members of its groups in Hydra's config store."""
-    from hydra.core.config_store import ConfigStore
+def split_list(text: str) -> tuple[str, ...]:
+    """Splits a list of text: commas separate items, `\\,` is a comma; the empty text is the empty list."""
+    return tuple(item.replace("\\,", ",") for item in re.split(r"(?<!\\),", text)) if text else ()
 
-    store = ConfigStore.instance()
-    node, before, after = settings(cls()), [], []
-    for item in fields(cls):
-        if item.metadata.get("like_group"):
-            node[item.name + LIKE_GROUP] = node.pop(item.name)
-    for group in groups_of(cls):
-        is_global = group.key in (PRESET, EXPERIMENT)
-        for name, member in group.members.items():
-            store.store(name=name, node=member, group=group.key, package="_global_" if is_global else None)
-        if is_global:
-            after.append({group.key: group.default})
-        else:
-            before.append({group.key: group.default})
-            *sections, last = group.key.split("/")
-            inner = node
-            for section in sections:
-                inner = inner[section]
-            del inner[last]
-    store.store(name=command, node={"defaults": [*before, "_self_", *after], **node})
+
+def join_list(items: Iterable[str]) -> str:
+    """The text that `split_list` splits into these items."""
+    return ",".join(item.replace(",", "\\,") for item in items)
 
 
 def option_of_several(key: str, choices: Choices) -> Option | None:
@@ -103,144 +92,6 @@ def full_key(key: str, choices: Choices) -> str | None:
     if len(ends) > 1:
         raise InputError(f"{key}: stands for more than one option; write {' or '.join(f'{end}=' for end in ends)}")
     return ends[0] if ends else None
-
-
-def check_member(key: str, member: str, choices: Choices, kind: str = "one") -> None:
-    """Checks that a choice has a member."""
-    names = choices.groups.get(key) or choices.groups[choices.options[key].several]
-    if member not in names:
-        raise InputError(f"{key}: expected {kind} of {', '.join(names)}, got {member!r}{near(member, names)}")
-
-
-def members_of(key: str, value: str, choices: Choices) -> list[str]:
-    """Overrides that add several members of a choice, each below a name of its own."""
-    pairs, group = named_members(value), choices.options[key].several
-    names = [name for name, _ in pairs]
-    if not pairs:
-        raise InputError(f"{key}: expected one or more of {', '.join(choices.groups[group])}, got {value!r}")
-    for name, member in pairs:
-        check_member(key, member, choices, "some")
-        if names.count(name) > 1:
-            raise InputError(f"{key}: {name} is given twice; give other names, such as {name}_2:{member}")
-        if not re.fullmatch(r"\w+", name, re.ASCII):
-            raise InputError(f"{key}: expected names of letters, digits and _, got {name!r}")
-    return [f"+{group}@{key}.{name}={member}" for name, member in pairs]
-
-
-def named_members(value: str) -> list[tuple[str, str]]:
-    """The names and members of a list such as [labels,dino:onnx]; a member without a name has its own."""
-    words = [word.strip() for word in value.removeprefix("[").removesuffix("]").split(",") if word.strip()]
-    return [(word.partition(":")[0], word.partition(":")[2] or word) for word in words]
-
-
-def check_single(data: Mapping[str, Any], texts: Mapping[str, str], choices: Choices) -> None:
-    """Checks that nothing was given for a single member of a choice where the command line or an experiment gives
-    several."""
-    for key, option in choices.options.items():
-        single = option.several
-        unused = [name for name in texts if single and (name == single or name.startswith(f"{single}."))]
-        if unused and (key in texts or data.get(key)):
-            source = key if key in texts else EXPERIMENT
-            name = unused[0].partition(".")[2] or "OPTION"
-            raise InputError(
-                f"{unused[0]}: is for a single {single}, and {source}={texts.get(source, '')} gives several; leave it "
-                f"out, or write {key}.NAME.{name}=… for one of them"
-            )
-
-
-HYDRA_KEY = re.compile(r"\+{0,2}hydra[./]")
-"""Settings of Hydra itself, with -m; + adds one, as `+hydra.launcher.additional_parameters.account=…`."""
-
-
-def hydra_error(error: Exception, texts: Mapping[str, str], choices: Choices) -> str:
-    """The message of an error of Hydra, explained where an option belongs to a member that was not chosen."""
-    text = " ".join(str(error).split())
-    if launcher := re.search(r"Could not find 'hydra/launcher/([^']+)'", text):
-        return (
-            f"hydra/launcher={launcher[1]}: no such launcher is installed; submitit_slurm and submitit_local come with "
-            "pip install 'gsencoder[slurm]'"
-        )
-    if twice := re.search(r"(\w+)@(\w+)\.(\w+) appears more than once", text):
-        return (
-            f"{twice[2]}.{twice[3]}: is given by {EXPERIMENT}={texts.get(EXPERIMENT, '')} and once more; leave out "
-            f"{twice[1]}=, since those of an experiment cannot be replaced, or leave out {EXPERIMENT}="
-        )
-    if (absent := re.search(r"Could not find '(\w+)/([^']+)'", text)) and absent[1] in choices.groups:
-        check_member(absent[1], absent[2], choices)
-    match = re.search(r"Could not override '([^']+)'", text)
-    key = match[1] if match else ""
-    if key not in texts:
-        return text
-    if HYDRA_KEY.match(key):
-        return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
-    section = key.rpartition(".")[0]
-    if key in choices.options:
-        group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
-        now = texts.get(group, choices.chosen.get(group))
-        return f"{key}: is an option of {' and '.join(choices.members[key]) or section}, and {group} is {now}"
-    field, _, name = section.partition(".")
-    single = field.removesuffix("s")
-    member = dict(named_members(texts.get(field, ""))).get(name)
-    if member is None:
-        return f"{key}: there is no {name} among the {field} of this run; {field}= names them"
-    owners = choices.members.get(f"{single}.{key.rpartition('.')[2]}", ())
-    return f"{key}: is an option of {' and '.join(owners)}, and {name} is {single}={member}"
-
-
-SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
-"""Form of the value of a text option that is swept, with -m."""
-
-
-def encode_text(text: str) -> str:
-    """Encodes text as a value in Hydra's grammar that resolves to exactly this text."""
-    digits = text.encode("utf-8", "surrogatepass").hex()
-    return f"'${{text:x{digits}}}'"
-
-
-def decode_text(digits: str) -> str:
-    """Decodes the digits that `encode_text` wrote."""
-    return bytes.fromhex(digits[1:]).decode("utf-8", "surrogatepass")
-
-
-@contextmanager
-def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iterator[Any]:
-    """Initializes Hydra with the defaults of a command and a folder of YAML files; its errors become InputErrors."""
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
-    store_settings(command, cls)
-    folder = str((conf or conf_folder()).resolve())
-    try:
-        with initialize_config_dir(config_dir=folder, job_name="gsencoder", version_base="1.3"):
-            yield GlobalHydra.instance().hydra
-    except (HydraException, OmegaConfBaseException) as error:
-        raise InputError(" ".join(str(error).split())) from error
-
-
-def split_list(text: str) -> tuple[str, ...]:
-    """Splits a list of text: commas separate items, `\\,` is a comma; the empty text is the empty list."""
-    return tuple(item.replace("\\,", ",") for item in re.split(r"(?<!\\),", text)) if text else ()
-
-
-def join_list(items: Iterable[str]) -> str:
-    """The text that `split_list` splits into these items."""
-    return ",".join(item.replace(",", "\\,") for item in items)
-
-
-def wrong_value(option: Option, value: Any) -> str:
-    """The message for a value of the wrong type."""
-    if isinstance(value, (list, tuple)) and option.kind == "list":
-        value = join_list(map(str, value))
-    members = union_members(option.annotation)
-    words = [each for member in members for each in (member, *list_items(member)) if get_origin(each) is Literal]
-    hint = near(str(value), [str(word) for each in words for word in get_args(each)])
-    is_list = any(get_origin(member) is tuple for member in members)
-    if is_list and option.kind == "value" and isinstance(value, str) and "," in value:
-        hint = f"; a list of numbers stands in brackets: {option.key}=[{value}]"
-    meaning = f" ({option.help})" if option.help and not hint else ""
-    return f"{option.key}: expected {describe(option.annotation)}, got {value!r}{hint}{meaning}"
 
 
 def read_words(
@@ -306,6 +157,78 @@ def _unknown(word: str, key: str, choices: Choices) -> str:
     return f"{bare_word.removesuffix('=…')}: no such option, and no file has this name{near(bare_word, keys)}"
 
 
+def check_member(key: str, member: str, choices: Choices, kind: str = "one") -> None:
+    """Checks that a choice has a member."""
+    names = choices.groups.get(key) or choices.groups[choices.options[key].several]
+    if member not in names:
+        raise InputError(f"{key}: expected {kind} of {', '.join(names)}, got {member!r}{near(member, names)}")
+
+
+def named_members(value: str) -> list[tuple[str, str]]:
+    """The names and members of a list such as [labels,dino:onnx]; a member without a name has its own."""
+    words = [word.strip() for word in value.removeprefix("[").removesuffix("]").split(",") if word.strip()]
+    return [(word.partition(":")[0], word.partition(":")[2] or word) for word in words]
+
+
+def members_of(key: str, value: str, choices: Choices) -> list[str]:
+    """Overrides that add several members of a choice, each below a name of its own."""
+    pairs, group = named_members(value), choices.options[key].several
+    names = [name for name, _ in pairs]
+    if not pairs:
+        raise InputError(f"{key}: expected one or more of {', '.join(choices.groups[group])}, got {value!r}")
+    for name, member in pairs:
+        check_member(key, member, choices, "some")
+        if names.count(name) > 1:
+            raise InputError(f"{key}: {name} is given twice; give other names, such as {name}_2:{member}")
+        if not re.fullmatch(r"\w+", name, re.ASCII):
+            raise InputError(f"{key}: expected names of letters, digits and _, got {name!r}")
+    return [f"+{group}@{key}.{name}={member}" for name, member in pairs]
+
+
+def check_single(data: Mapping[str, Any], texts: Mapping[str, str], choices: Choices) -> None:
+    """Checks that nothing was given for a single member of a choice where the command line or an experiment gives
+    several."""
+    for key, option in choices.options.items():
+        single = option.several
+        unused = [name for name in texts if single and (name == single or name.startswith(f"{single}."))]
+        if unused and (key in texts or data.get(key)):
+            source = key if key in texts else EXPERIMENT
+            name = unused[0].partition(".")[2] or "OPTION"
+            raise InputError(
+                f"{unused[0]}: is for a single {single}, and {source}={texts.get(source, '')} gives several; leave it "
+                f"out, or write {key}.NAME.{name}=… for one of them"
+            )
+
+
+def encode_text(text: str) -> str:
+    """Encodes text as a value in Hydra's grammar that resolves to exactly this text."""
+    digits = text.encode("utf-8", "surrogatepass").hex()
+    return f"'${{text:x{digits}}}'"
+
+
+def decode_text(digits: str) -> str:
+    """Decodes the digits that `encode_text` wrote."""
+    return bytes.fromhex(digits[1:]).decode("utf-8", "surrogatepass")
+
+
+# A launcher that runs jobs in other processes imports this module there before it resolves the settings.
+OmegaConf.register_new_resolver("text", decode_text, replace=True)
+
+
+def wrong_value(option: Option, value: Any) -> str:
+    """The message for a value of the wrong type."""
+    if isinstance(value, (list, tuple)) and option.kind == "list":
+        value = join_list(map(str, value))
+    members = union_members(option.annotation)
+    words = [each for member in members for each in (member, *list_items(member)) if get_origin(each) is Literal]
+    hint = near(str(value), [str(word) for each in words for word in get_args(each)])
+    is_list = any(get_origin(member) is tuple for member in members)
+    if is_list and option.kind == "value" and isinstance(value, str) and "," in value:
+        hint = f"; a list of numbers stands in brackets: {option.key}=[{value}]"
+    meaning = f" ({option.help})" if option.help and not hint else ""
+    return f"{option.key}: expected {describe(option.annotation)}, got {value!r}{hint}{meaning}"
+
+
 def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:
     """The settings in Hydra's grammar, with text encoded; each is parsed separately, so that errors name it."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -347,6 +270,90 @@ def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False
             raise InputError(f"{wrong_value(option, value)}; several values, one run each, need -m")
         hydra_overrides.append(f"{name}={text}")
     return hydra_overrides
+
+
+def store_settings(command: str, cls: type[CommonConfig]) -> None:
+    """Stores the defaults of a command and the members of its groups in Hydra's config store."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance()
+    node, before, after = settings(cls()), [], []
+    for item in fields(cls):
+        if item.metadata.get("like_group"):
+            node[item.name + LIKE_GROUP] = node.pop(item.name)
+    for group in groups_of(cls):
+        is_global = group.key in (PRESET, EXPERIMENT)
+        for name, member in group.members.items():
+            store.store(name=name, node=member, group=group.key, package="_global_" if is_global else None)
+        if is_global:
+            after.append({group.key: group.default})
+        else:
+            before.append({group.key: group.default})
+            *sections, last = group.key.split("/")
+            inner = node
+            for section in sections:
+                inner = inner[section]
+            del inner[last]
+    store.store(name=command, node={"defaults": [*before, "_self_", *after], **node})
+
+
+@contextmanager
+def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iterator[Any]:
+    """Initializes Hydra with the defaults of a command and a folder of YAML files; its errors become InputErrors."""
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    store_settings(command, cls)
+    folder = str((conf or conf_folder()).resolve())
+    try:
+        with initialize_config_dir(config_dir=folder, job_name="gsencoder", version_base="1.3"):
+            yield GlobalHydra.instance().hydra
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(" ".join(str(error).split())) from error
+
+
+def hydra_error(error: Exception, texts: Mapping[str, str], choices: Choices) -> str:
+    """The message of an error of Hydra, explained where an option belongs to a member that was not chosen."""
+    text = " ".join(str(error).split())
+    if launcher := re.search(r"Could not find 'hydra/launcher/([^']+)'", text):
+        return (
+            f"hydra/launcher={launcher[1]}: no such launcher is installed; submitit_slurm and submitit_local come with "
+            "pip install 'gsencoder[slurm]'"
+        )
+    if twice := re.search(r"(\w+)@(\w+)\.(\w+) appears more than once", text):
+        return (
+            f"{twice[2]}.{twice[3]}: is given by {EXPERIMENT}={texts.get(EXPERIMENT, '')} and once more; leave out "
+            f"{twice[1]}=, since those of an experiment cannot be replaced, or leave out {EXPERIMENT}="
+        )
+    if (absent := re.search(r"Could not find '(\w+)/([^']+)'", text)) and absent[1] in choices.groups:
+        check_member(absent[1], absent[2], choices)
+    match = re.search(r"Could not override '([^']+)'", text)
+    key = match[1] if match else ""
+    if key not in texts:
+        return text
+    if HYDRA_KEY.match(key):
+        return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
+    section = key.rpartition(".")[0]
+    if key in choices.options:
+        group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
+        now = texts.get(group, choices.chosen.get(group))
+        return f"{key}: is an option of {' and '.join(choices.members[key]) or section}, and {group} is {now}"
+    field, _, name = section.partition(".")
+    single = field.removesuffix("s")
+    member = dict(named_members(texts.get(field, ""))).get(name)
+    if member is None:
+        return f"{key}: there is no {name} among the {field} of this run; {field}= names them"
+    owners = choices.members.get(f"{single}.{key.rpartition('.')[2]}", ())
+    return f"{key}: is an option of {' and '.join(owners)}, and {name} is {single}={member}"
+
+
+def plain_settings(composed: Any) -> dict[str, Any]:
+    """The composed settings as plain dicts, lists and scalars, without Hydra's own."""
+    own = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
+    data = cast(dict[str, Any], OmegaConf.to_container(own, resolve=True))
+    return {key.removesuffix(LIKE_GROUP): value for key, value in data.items()}
 
 
 def _number(target: type, accepted: tuple[type, ...]) -> Any:
@@ -392,6 +399,15 @@ def _section(annotation: Any, value: Any, key: str) -> Any:
     return from_dict(by_name[name], value, key + ".")
 
 
+def _named(message: str, prefix: str, names: Iterable[str]) -> str:
+    """The message of an error of a settings class, with the name of the section before that of each field."""
+    head, _, problem = message.partition(":")
+    named = re.split(r"(, | and )", head)
+    if not prefix or any(name.split("[")[0] not in names for name in named[::2]):
+        return f"{prefix.rstrip('.')}: {message}" if prefix else message
+    return f"{''.join(prefix + word if index % 2 == 0 else word for index, word in enumerate(named))}:{problem}"
+
+
 def from_dict(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
     """Builds settings from plain dicts, lists and scalars; missing options have their defaults."""
     import dacite
@@ -417,15 +433,6 @@ def from_dict(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
         raise InputError(_named(str(error), prefix, types)) from error
 
 
-def _named(message: str, prefix: str, names: Iterable[str]) -> str:
-    """The message of an error of a settings class, with the name of the section before that of each field."""
-    head, _, problem = message.partition(":")
-    named = re.split(r"(, | and )", head)
-    if not prefix or any(name.split("[")[0] not in names for name in named[::2]):
-        return f"{prefix.rstrip('.')}: {message}" if prefix else message
-    return f"{''.join(prefix + word if index % 2 == 0 else word for index, word in enumerate(named))}:{problem}"
-
-
 def compose(
     command: str, cls: type[Config], words: Sequence[str], conf: Path | None = None, choices: Choices | None = None
 ) -> Config:
@@ -446,17 +453,6 @@ def compose(
         data = plain_settings(composed)
         check_single(data, texts, choices)
         return from_dict(cls, data)
-
-
-def plain_settings(composed: Any) -> dict[str, Any]:
-    """The composed settings as plain dicts, lists and scalars, without Hydra's own."""
-    own = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
-    data = cast(dict[str, Any], OmegaConf.to_container(own, resolve=True))
-    return {key.removesuffix(LIKE_GROUP): value for key, value in data.items()}
-
-
-# A launcher that runs jobs in other processes imports this module there before it resolves the settings.
-OmegaConf.register_new_resolver("text", decode_text, replace=True)
 
 
 def _job(
