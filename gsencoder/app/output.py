@@ -67,8 +67,8 @@ AT_FDCWD, RENAME_EXCHANGE = -100, 2
 def output_folder(path: str | Path, *, overwrite: bool = False, record: Record | None = None) -> Iterator[Path]:
     """Opens a folder to write into, which is renamed to `path` when the block ends without an error.
 
-    Until then it is a hidden folder beside it, `.NAME.partial-XXXXXXXX`. It is removed if the block ends early, also by
-    an interrupt; the folder of a killed run is removed by the next run that writes to the same path. Everything is
+    Until then it is the hidden folder `.NAME.partial-XXXXXXXX` next to it. It is removed if the block ends early, also
+    by an interrupt; the folder of a killed run is removed by the next run that writes to the same path. Everything is
     synced to disk before the folder is renamed.
 
     Args:
@@ -282,7 +282,7 @@ _PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "([0-9a-f]+[.])?tmp
 
 
 def sibling_folder(out: Path, suffix: str) -> Path:
-    """The folder OUT.suffix beside an output folder; behind a symbolic link, beside the folder that it leads to."""
+    """The folder OUT.suffix next to an output folder; of a symbolic link, next to the folder that it leads to."""
     target = Path(os.path.realpath(out))
     return target.with_name(f"{target.name}.{suffix}")
 

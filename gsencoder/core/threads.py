@@ -68,7 +68,7 @@ compiled = functools.partial(Kernel, fused=False)
 def _warn_uncached() -> None:
     warnings.warn(
         "compiled kernels cannot be stored beside the package or in the user's cache, so that every run compiles them "
-        "anew, for up to a minute; NUMBA_CACHE_DIR=FOLDER names a folder that can be written",
+        "again, for up to a minute; NUMBA_CACHE_DIR=FOLDER names a folder that can be written",
         SceneWarning,
         stacklevel=3,
     )
@@ -88,8 +88,8 @@ def thread_count() -> int:
     torch_threads = getattr(sys.modules.get("torch"), "get_num_threads", None)
     if torch_threads is not None:
         return min(int(torch_threads()), cores)
-    stated = os.environ.get("OMP_NUM_THREADS", "")
-    return min(max(int(stated), 1), cores) if stated.isdecimal() else cores
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    return min(max(int(limit), 1), cores) if limit.isdecimal() else cores
 
 
 def available_cores() -> int:

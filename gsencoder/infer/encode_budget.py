@@ -64,7 +64,7 @@ def exact_encoding(config: EncodeConfig) -> EncodeConfig:
 
 PARTS = 2
 LEAST_ROWS, MOST_ROWS, SHARE = 256, 4096, 64
-"""A part holds one of so many Gaussians of the scene, within these bounds. Larger parts did not predict better."""
+"""Gaussians of the scene for each one in a part, within these bounds. Larger parts did not predict better."""
 ROUNDING_ROWS = 512
 """Gaussians on which precisions are compared: parts of a scene differ in it by less than a tenth."""
 BINS = 8
@@ -101,7 +101,7 @@ EXPONENT = 0.8
 SMALL_SCENE = 20_000
 """Scenes of fewer Gaussians that are not cut are encoded exactly: choosing would cost more than it saves."""
 CUT_ROWS = 100_000
-"""Chunks of larger scenes are counted on so many of their Gaussians, in chunks that are as much smaller."""
+"""Chunks of larger scenes are counted on this many of their Gaussians, in chunks that are as much smaller."""
 SAFETY = 5.0
 """The error that parts of a scene predict was a third to five times that of the whole scene."""
 
@@ -303,7 +303,7 @@ def seen_around(means: Float32[np.ndarray, "N 3"], chunks: Sequence[Chunk]) -> F
 
 
 def _box_around(gaussians: Gaussians, center: int, count: int) -> Int64[np.ndarray, " n"]:
-    """The Gaussians of the cube around one that holds so many."""
+    """The Gaussians of the cube around one that holds this many."""
     if count >= len(gaussians):
         return np.arange(len(gaussians))
     far = np.abs(gaussians.means - gaussians.means[center]).max(axis=1)

@@ -113,7 +113,7 @@ class FeatureField:
         self.products = GaussianProducts(features, config.mode)
 
     def stride_in(self, cameras: Cameras, view: int) -> int:
-        """Every so many pixels of a view are looked at."""
+        """The distance in pixels between those of a view that are looked at."""
         if self.config.stride is not None:
             return self.config.stride
         stride = 1 if self.memory is None else MEMORY_STRIDE

@@ -138,7 +138,7 @@ def attention_picture(
 
 
 def fit_in(rgb: UInt8[np.ndarray, "h w 3"], side: int) -> tuple[Image.Image, float]:
-    """A picture enlarged or reduced so that its longer side has so many pixels, and the factor."""
+    """A picture enlarged or reduced so that its longer side has this many pixels, and the factor."""
     factor = side / max(rgb.shape[:2])
     size = tuple(max(1, round(length * factor)) for length in (rgb.shape[1], rgb.shape[0]))
     return Image.fromarray(np.ascontiguousarray(rgb)).resize(size, Image.Resampling.BICUBIC), factor

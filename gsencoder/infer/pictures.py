@@ -62,7 +62,7 @@ class AttendedQueries:
         removed = mean if mode == "centered" else np.zeros_like(mean)
         # The weights of the components sum to 1, so that the mean can be taken off the components.
         local = memory.bank.components - removed
-        # Features are means of the components: so many axes hold them.
+        # Features are means of the components, which lie in as many axes.
         self._axes = np.linalg.qr(local.T)[0] if len(local) < local.shape[1] else np.eye(local.shape[1])
         features = memory.attend(queries, (local @ self._axes).astype(np.float32))
         squares = np.einsum("ps,ps->p", features, features, dtype=np.float64)
@@ -89,7 +89,7 @@ def pixel_features(
 
 
 SPARE = 4
-"""At least so many views beside the wanted ones are blended before the best are chosen."""
+"""Smallest number of further views that are blended before the best are chosen."""
 _SIDE = 96
 """Views are judged at this size, longer side in pixels, which is enough to see who sees what."""
 

@@ -228,14 +228,14 @@ def labels_of_parts(parts: Parts, relevancy: Float32[np.ndarray, "Q N"]) -> Int3
 CORE_QUANTILE = 0.75
 """Gaussians of a part above this quantile of their relevancy are pure enough to stand for the object."""
 GAP = 1.0
-"""Gaussians nearer to a part than so many spacings are rims, and do not stand for its surroundings."""
+"""Gaussians nearer to a part than this many spacings are rims, and do not stand for its surroundings."""
 SURROUNDINGS = 2.0
-"""Surroundings go as far as so many times the reach."""
+"""Reach of the surroundings, in multiples of the reach."""
 RIM = 2.0
-"""Gaussians of a part that are farther than so many spacings from all others are inside of the object, whatever their
+"""Gaussians of a part that are farther than this many spacings from all others are inside of the object, whatever their
 feature: the surface of a real table has features of many things."""
 NEIGHBORS = 8
-"""So many nearest Gaussians give the feature of the object, or of its surroundings, at a place."""
+"""Number of the nearest Gaussians that give the feature of the object, or of its surroundings, at a place."""
 BLOCK_BYTES = 1 << 26
 
 
@@ -254,7 +254,7 @@ def object_shares(
     Args:
         relevancy: of all Gaussians for the word; finite where `features` were seen.
         spacing: of the scene, world units.
-        reach: candidates lie within so many spacings of `rows`.
+        reach: candidates lie within this many spacings of `rows`.
         same: the Gaussians of all parts of the word, which are no surroundings.
 
     Returns:

@@ -81,7 +81,7 @@ SAMPLE = 20_000
 MIN_RELATIVE_NORM = 1e-3
 """Share of the mean's length below which a centered feature is rounding, not direction."""
 MAX_NAMES = 1000
-"""Up to so many vectors of coded maps are all components, unless another number or threshold is asked for."""
+"""Up to this many vectors of coded maps are all components, unless another number or threshold is asked for."""
 SAME_KIND_COSINE = 0.95
 """Features within this of another one are of its kind."""
 

@@ -75,7 +75,7 @@ class RowLimitError(InputError):
 def index_features(
     features: GaussianFeatures, config: IndexConfig = IndexConfig(), *, most: int | None = None
 ) -> IndexMemory:
-    """Makes a table of rows that features share, at most so many, or as many as two bytes can number."""
+    """Makes a table of rows that features share, at most `most`, or as many as two bytes can number."""
     seen = np.flatnonzero(features.seen)
     if not len(seen):
         raise InputError("index: no Gaussian has features")
@@ -116,7 +116,7 @@ def index_features(
 def _leaders(
     centered: Float32[np.ndarray, "n C"], config: IndexConfig, limit: int, *, search: bool
 ) -> tuple[float, Int64[np.ndarray, " M"]]:
-    """The threshold of a cover, and its rows, at most so many; with `search` an error says which threshold has them."""
+    """The threshold of a cover, and its rows, at most `limit`; with `search` an error says which threshold has them."""
 
     def cover(threshold: float, limit: int) -> CoverReduction:
         reduction = CoverReduction(centered.shape[1], threshold)
@@ -190,7 +190,7 @@ def index_within(
     Gaussians, and is nearer to them. All Gaussians then decide, from there on towards what is safe.
 
     Args:
-        bytes_of: of a package with a table of so many rows.
+        bytes_of: of a package with a table of this many rows.
 
     Returns:
         The table, and its error: 1 − mean centered cosine over Gaussians, or over their kinds where that is larger.

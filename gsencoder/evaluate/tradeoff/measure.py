@@ -78,7 +78,7 @@ class Records:
         first, *lines = complete.splitlines() or [b""]
         if first != self._identity:
             raise InputError(
-                f"{folder}: holds measurements of a sweep with other settings; give resume=false to begin anew, or "
+                f"{folder}: holds measurements of a sweep with other settings; give resume=false to start again, or "
                 "another out="
             )
         for number, line in enumerate(lines, start=2):
@@ -86,7 +86,7 @@ class Records:
                 self._take(json.loads(line))
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise InputError(
-                    f"{self._path}: line {number} is damaged ({error}); give resume=false to begin anew"
+                    f"{self._path}: line {number} is damaged ({error}); give resume=false to start again"
                 ) from error
         if rest:
             write_bytes(self._path, complete + newline)

@@ -421,9 +421,9 @@ def effective_knobs(
     for knob in knobs:
         for row in rows:
             others = {name: value for name, value in row[0].knobs.items() if name != knob.name}
-            beside = by_label.get(describe_values(others), base)
-            changes_one = knob.name in row[0].knobs and (not others or others == dict(beside[0].knobs))
-            if changes_one and any(_is_effect(each, least) for each, least in _effects(row, beside, cost)):
+            baseline = by_label.get(describe_values(others), base)
+            changes_one = knob.name in row[0].knobs and (not others or others == dict(baseline[0].knobs))
+            if changes_one and any(_is_effect(each, least) for each, least in _effects(row, baseline, cost)):
                 with_effect.add(knob.name)
     return [knob.name for knob in knobs if knob.name in with_effect]
 

@@ -318,7 +318,7 @@ class VlmServer:
 
 
 def _ends_within(seconds: float, work: Callable[[], None]) -> bool:
-    """Whether work in a thread of its own has ended after so many seconds; else it is left alone. A connection that
+    """Whether work in a thread of its own has ended after this many seconds; else it is left alone. A connection that
     stays alive without a word is told from an answer by the clock alone, and from outside."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()

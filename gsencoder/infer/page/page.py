@@ -265,7 +265,7 @@ def jpeg_of(views: Views | None, view: int, side: int) -> bytes:
 FEWEST_GAUSSIANS = 1000
 """A page with fewer shows nothing that can be recognized."""
 THINNING = 0.9
-"""Of the Gaussians that should fit by proportion, so many are taken."""
+"""Share that is taken of the Gaussians that should fit by proportion."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -190,8 +190,8 @@ def choose_views_within(
 
 
 def order_by_error(scores: Sequence[ViewScores]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Candidates in the order in which each leaves least unseen beside those before it, and by how much each lowers the
-    error; those that show nothing more are left out, except the first."""
+    """Candidates in the order in which each leaves least unseen, and by how much each lowers the error; those that show
+    nothing more than the ones before are left out, except the first."""
     parts = []
     for each in scores:
         # Only Gaussians that any candidate shows count.
@@ -344,7 +344,7 @@ def _selected(views: ViewSet, rows: Int64[np.ndarray, " n"]) -> ViewSet:
 
 
 def _resized(views: ViewSet, side: int) -> ViewSet:
-    """The same views in pictures whose longer side has at most so many pixels."""
+    """The same views in pictures whose longer side has at most this many pixels."""
     return replace(views, cameras=views.cameras.resized(side, enlarge=False))
 
 

@@ -229,7 +229,7 @@ class FreeSpace:
 def frames_on(
     cameras: Cameras, gaussians: Gaussians, targets: Sequence[Target], count: int, spaces: Sequence[FreeSpace]
 ) -> Int64[np.ndarray, " n"]:
-    """The frames that show most of the targets as far as a few rays tell, ascending; at most so many.
+    """The frames that show most of the targets as far as a few rays tell, ascending; at most `count`.
 
     Targets take turns. Each takes its best frames for half of the places, and for the others some from all along the
     recording, so that the frames of a film are not all neighbors. Spaces are what rays meet, one for each target, which
@@ -322,7 +322,7 @@ def shell_cameras(
     Directions lie on a spiral. Along each the distance is the one at which the target's outline fills a share of the
     picture, its frame permitting, or nearer where a surface would stand between. Directions are left out from which the
     camera would be too near to a surface, where no known camera has looked, or so near that little else is seen. Of
-    those that remain the ones are kept with most of the scene behind and around the target, evenly spread; none where
+    the others the ones are kept with most of the scene behind and around the target, evenly spread; none where
     there is no room."""
     focal = width / (2 * math.tan(math.radians(CONSTANTS.fov_degrees) / 2))
     outward, vertical = spiral_directions(max(CONSTANTS.tried_directions * count, CONSTANTS.min_tried_directions), up)
@@ -357,14 +357,14 @@ def _background_fraction(
     right, down, _ = np.moveaxis(look_rotation(forward, vertical), 1, 0)
     hits = np.zeros(len(centers))
     length = np.full(len(centers), CONSTANTS.max_ray_cells * free.cell)
-    beside = CONSTANTS.background_radii * target.radius
+    offset = CONSTANTS.background_radii * target.radius
     for across in (-1.0, 0.0, 1.0):
         for along in (-1.0, 0.0, 1.0):
-            through = target.center + beside * (across * right + along * down)
+            through = target.center + offset * (across * right + along * down)
             ray = through - centers
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
             # They begin before the target, so that what it hangs on or lies on counts from either side.
-            hits += np.isfinite(free.first_hit(through - beside * ray, ray, length))
+            hits += np.isfinite(free.first_hit(through - offset * ray, ray, length))
     return hits / 9
 
 

@@ -26,7 +26,7 @@ from gsencoder.types.checks import move_origin
 SOLID_WEIGHT = 0.5
 """A pixel shows a target from so much weight on."""
 MIN_MARKED_PIXELS = 12
-"""A target is marked where so many pixels show it."""
+"""Pixels that must show a target for it to be marked."""
 MAX_MARK_COVER = 0.25
 """A disc stands on its target if it hides no more of it than that, and beside it otherwise."""
 DIRECTIONS = 8
@@ -94,7 +94,7 @@ def _mark_position(
 
 PictureKind = Literal["photograph", "render"]
 MIN_DESCRIBED_SHARE = 0.0005
-"""Smaller shares of a picture are not told."""
+"""Smaller shares of a picture are not described."""
 
 
 def picture_kinds(scene: Scene, views: ViewSet) -> tuple[PictureKind, ...]:
@@ -144,11 +144,11 @@ def view_sheet(scene: Scene, views: ViewSet, pictures: Sequence[Picture], boxes:
 
 def describe_view(chosen: SelectedView) -> str:
     """Describes a view in one line."""
-    shown = [sight for sight in chosen.target_scores if sight.share >= MIN_DESCRIBED_SHARE]
+    shown = [score for score in chosen.target_scores if score.share >= MIN_DESCRIBED_SHARE]
     description = "; ".join(
-        f"{sight.target} fills {sight.share:{'.0%' if sight.share >= 0.01 else '.1%'}}, "
-        f"{sight.visible * sight.inside:.0%} of it seen"
-        for sight in shown
+        f"{score.target} fills {score.share:{'.0%' if score.share >= 0.01 else '.1%'}}, "
+        f"{score.visible * score.inside:.0%} of it seen"
+        for score in shown
     )
     return f"{chosen.name}: {description or 'nothing of what was found'}" if chosen.target_scores else chosen.name
 

@@ -38,8 +38,8 @@ class ViewConstants:
     grid_cells: int = 1 << 20  # Cells along each side of the grid: three coordinates fit into 60 bits of an int64
     max_ray_cells: int = 512  # Cells through which a ray is followed at most
     clearance_neighbors: int = 8  # Patches whose surfaces are compared for the distance to the nearest one
-    surface_sigmas: float = 2.0  # A Gaussian's surface is so many standard deviations from its center
-    max_uncut_edges: float = 2.0  # Gaussians of at most so many edges are not cut into patches
+    surface_sigmas: float = 2.0  # Standard deviations from a Gaussian's center to its surface
+    max_uncut_edges: float = 2.0  # Gaussians of at most this many edges are not cut into patches
     # Patches that one Gaussian is cut into at most; a larger one gets larger patches.
     max_patches_per_gaussian: int = 4096
     # Patches that a splat is cut into at most, as far as one for each Gaussian allows (memory).
@@ -49,7 +49,7 @@ class ViewConstants:
     frame_rays: int = 12  # Rays from a target to each frame
     frame_batch: int = 32  # Frames whose rays are followed together (memory)
     blocked_frame_weight: float = 0.02  # Weight of a frame all of whose rays are blocked: rays may err
-    # Half of the frames are spread over the recording; they are taken from so many times as many …
+    # Half of the frames are spread over the recording; they are taken from this many times as many …
     spread_frames: int = 4
     # … that show at least this share of what the best frame shows: the best of a film are neighbors.
     min_spread_share: float = 0.25
@@ -71,7 +71,7 @@ class ViewConstants:
     clearance_share: float = 0.2
     outline_cells: int = 16  # Cells along a target's radius in which its outline is counted
     outline_sample: int = 1000  # Gaussians of a target that make its outline
-    background_radii: float = 1.5  # Rays that test what is behind a target pass so many radii beside its center
+    background_radii: float = 1.5  # Radii from its center at which rays test what is behind a target
 
     # Close-ups from photographs
     closeup_sample: int = 1000  # Gaussians of a target that tell where it is in a frame
@@ -84,7 +84,7 @@ class ViewConstants:
     # Scores by small renders
     # Accuracy of the small renders: rays end where a fiftieth of their light is left.
     score_blend: BlendConfig = field(default_factory=lambda: BlendConfig(stop_transmittance=0.02, min_weight=1e-3))
-    context_radii: float = 2.0  # A target's context is what lies in the ball of so many times its radius
+    context_radii: float = 2.0  # Radius of the ball that is a target's context, in radii of the target
     coverage_sample: int = 2000  # Gaussians of a target, and of its context, on which coverage is computed
     min_weight: float = 0.05  # Blending weight from which on a pixel shows a target
     solid_share: float = 0.5
@@ -94,10 +94,10 @@ class ViewConstants:
     frame_margin: float = 0.5
 
     # Budgets of error and of megabytes
-    # A Gaussian reaches no farther than so many standard deviations in a picture, and is left out of none by it.
+    # A Gaussian reaches no farther than this many standard deviations in a picture, and is left out of none by it.
     window_sigmas: float = 6.0
-    error_safety: float = 1.2  # What small renders leave unseen counts so many times …
-    unsure_gaussians: float = 2.0  # … and so many Gaussians of each target count as unseen on top of it
+    error_safety: float = 1.2  # Factor on what small renders leave unseen …
+    unsure_gaussians: float = 2.0  # … and Gaussians of each target that count as unseen on top of it
     # Pictures are made no smaller by a budget, longer side, pixels: the input of the smallest common vision towers.
     least_picture_side: int = 224
 
