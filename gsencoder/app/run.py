@@ -32,9 +32,8 @@ from gsencoder.app.output import (
 from gsencoder.core.budget import Budget
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, listed, one_line, printable
 from gsencoder.core.files import SUMMARY_NAME, plain, read_foreign_text
-from gsencoder.core.process import Device, ProcessRank, peak_memory_mb, refuse_several
+from gsencoder.core.process import Device, ProcessRank, available_cores, peak_memory_mb, refuse_several
 from gsencoder.core.settings import describe_values, format_value
-from gsencoder.core.threads import available_cores
 from gsencoder.data.scenes import check_names, scene_name
 from gsencoder.data.up import Up
 

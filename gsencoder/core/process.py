@@ -301,6 +301,12 @@ def memory_growth() -> Iterator[Growth]:
     growth.mib = max(status_kib("VmHWM") - before, 0) / 1024
 
 
+def available_cores() -> int:
+    """The cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+
+
 def peak_memory_mb() -> float:
     """Peak resident memory of this process, MiB."""
     # On Linux ru_maxrss starts from the size of the parent at the fork; VmHWM is that of the process alone.

@@ -92,12 +92,6 @@ def thread_count() -> int:
     return min(max(int(limit), 1), cores) if limit.isdecimal() else cores
 
 
-def available_cores() -> int:
-    """The cores that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
-
-
 @contextlib.contextmanager
 def threads_of_torch(count: int) -> Iterator[None]:
     """Lets torch and the kernels use `count` threads within the block. torchrun starts each of several processes with

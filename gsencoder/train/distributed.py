@@ -26,8 +26,7 @@ from torch.distributed import DistNetworkError, PrefixStore, TCPStore  # type: i
 
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.core.process import Device, ProcessRank, rank_from_environment, store_address
-from gsencoder.core.threads import available_cores
+from gsencoder.core.process import Device, ProcessRank, available_cores, rank_from_environment, store_address
 
 BEAT_SECONDS = 5.0
 """Between two counts of a process."""

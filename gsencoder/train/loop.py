@@ -28,9 +28,9 @@ from gsencoder.core.device import autocast_dtype, to_device
 from gsencoder.core.errors import InputError, error_hint
 from gsencoder.core.files import plain
 from gsencoder.core.logs import Log
-from gsencoder.core.process import Precision, ProcessRank, Track, defer_signals, stop_of, untracked
+from gsencoder.core.process import Precision, ProcessRank, Track, available_cores, defer_signals, stop_of, untracked
 from gsencoder.core.settings import CheckedConfig, first_difference, option
-from gsencoder.core.threads import available_cores, threads_of_torch
+from gsencoder.core.threads import threads_of_torch
 from gsencoder.train import distributed
 from gsencoder.train.distributed import (
     STOPPED_ELSEWHERE,

@@ -10,8 +10,8 @@ from forked_ranks import RankServer
 from training_scenes import DenseSideTeacher, prepared, small_encoder
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import ProcessRank, rank_from_environment, untracked
-from gsencoder.core.threads import available_cores, threads_of_torch
+from gsencoder.core.process import ProcessRank, available_cores, rank_from_environment, untracked
+from gsencoder.core.threads import threads_of_torch
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train.distributed import (

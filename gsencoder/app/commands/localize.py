@@ -105,14 +105,14 @@ def run(config: LocalizeCommandConfig, run: Run) -> None:
         if config.report:
             with run.step("report"):
                 report_words(target, scene, localization, run)
+    lines = []
     for word in words:
-        run.print(f"{one_line(word)}: {_first_box(localization, word)}")
-        run.print(*(f"  {one_line(describe_point(point))}" for point in points if point["query"] == word))
+        lines.append(f"{one_line(word)}: {_first_box(localization, word)}")
+        lines += [f"  {one_line(describe_point(point))}" for point in points if point["query"] == word]
     drawn_files = "boxes.ply and pictures" if config.pictures and scene.views is not None else "boxes.ply"
     more = f" {FROM_POSE}," if cameras is not None else ""
-    run.print(
-        f"{out}: boxes.json, words.json,{more} {drawn_files}; boxes are drawn around Gaussian {config.localize.extent}"
-    )
+    files = f"boxes.json, words.json,{more} {drawn_files}"
+    run.print(*lines, f"{out}: {files}; boxes are drawn around Gaussian {config.localize.extent}")
 
 
 def _first_box(localization: Localization, word: str) -> str:
