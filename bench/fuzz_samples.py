@@ -21,7 +21,7 @@ from gsencoder.core import archive
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import read_class_list, read_label_map
 from gsencoder.data.labels.expressions import read_nr3d, read_scanrefer
-from gsencoder.data.labels.files import read_mask, read_split, read_whole_numbers
+from gsencoder.data.labels.files import read_integer_lines, read_mask, read_split
 from gsencoder.data.labels.mesh import read_mesh
 from gsencoder.data.labels.questions import Question
 from gsencoder.data.labels.questions import read_questions as read_labeled_questions
@@ -228,7 +228,7 @@ KINDS: dict[str, Callable[[Path], Sample]] = {
     "label map": lambda f: one(f, "m.tsv", MAP, lambda path: read_label_map(path, "nyu40id")),
     "class list": lambda f: one(f, "c.txt", "wall\nfloor\noffice chair\n", read_class_list),
     "split": lambda f: one(f, "s.txt", "scene0011_00\nscene0011_01\n", read_split),
-    "whole numbers": lambda f: one(f, "n.txt", "4001\n4002\n0\n5001\n", read_whole_numbers),
+    "whole numbers": lambda f: one(f, "n.txt", "4001\n4002\n0\n5001\n", read_integer_lines),
     "mask of numbers": lambda f: one(f, "n.txt", "0\n1\n1\n0\n", read_mask),
     "instance truth": lambda f: one(f, "s0.txt", "4001\n4001\n0\n5001\n", read_instance_ids),
     "instance predictions": instances,

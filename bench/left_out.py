@@ -34,7 +34,7 @@ from gsencoder.infer.encode import load_encoder
 from gsencoder.render import blend
 from gsencoder.teachers.build import words_of
 from gsencoder.types import FeatureMap, GaussianFeatures, Gaussians, Scene
-from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.types.scene import OPENCV_FROM_OPENGL, invert_rigid
 
 MIN_ALPHA = 0.5
 SPLAT = "splat.ply"

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import seed
-from gsencoder.reconstruct.parameters import RowAdam, camera_of, parameters_from, rows_in_view
+from gsencoder.reconstruct.optimize import RowAdam, camera_of, parameters_from, rows_in_view
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Cameras, Gaussians
 

@@ -17,7 +17,7 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.data.labels.files import write_whole_numbers
+from gsencoder.data.labels.files import write_integer_lines
 from gsencoder.evaluate.benchmarks.instances import (
     InstancePrediction,
     instance_scores,
@@ -88,7 +88,7 @@ def main() -> None:
         for seed in range(FILE_SCENES):
             ids, prediction = random_scene(seed, options.instances, kinds[0])
             write_instance_prediction(folders[0], prediction)
-            write_whole_numbers(folders[1] / f"{prediction.scene}.txt", ids)
+            write_integer_lines(folders[1] / f"{prediction.scene}.txt", ids)
         start = time.perf_counter()
         instance_scores(list(match_instance_files(*folders, CLASSES)), CLASSES)
         seconds = (time.perf_counter() - start) / FILE_SCENES

@@ -2,7 +2,7 @@
 
 Frames are named in the arguments (`target_from_source`). Camera axes are OpenCV's, quaternions are wxyz, pixel centers
 lie at .5, scales are standard deviations. Every function keeps the dtype and device that it is given. The pinhole and
-rigid transforms of numpy arrays, which need no torch, are those of `Cameras` and gsencoder.types.checks.
+rigid transforms of numpy arrays, which need no torch, are those of gsencoder.types.scene.
 """
 
 import math

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.data.labels.files import mask_bytes
 from gsencoder.evaluate.benchmarks.instances import (
     InstancePrediction,
     InstanceScores,
@@ -58,7 +57,7 @@ def write_text_prediction(folder: Path, prediction: InstancePrediction) -> Path:
     for index, rows in enumerate(prediction.masks):
         name = f"predicted_masks/{prediction.scene}_{index:03d}.txt"
         mask = np.isin(np.arange(prediction.num_vertices), rows)
-        (folder / name).write_bytes(mask_bytes(mask))
+        (folder / name).write_text("".join(f"{int(inside)}\n" for inside in mask))
         lines.append(f"{name} {prediction.labels[index]} {float(prediction.scores[index])!r}\n")
     (folder / f"{prediction.scene}.txt").write_text("".join(lines))
     return folder / f"{prediction.scene}.txt"

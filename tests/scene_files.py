@@ -10,8 +10,7 @@ import numpy as np
 from PIL import Image
 from splats import gaussians_at
 
-from gsencoder.data.readers.posed import PosedImage
-from gsencoder.data.readers.undistort import CameraModel
+from gsencoder.data.readers.posed import CameraModel, PosedImage
 from gsencoder.types import Gaussians
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -84,7 +83,7 @@ def write_colmap(
     offset: tuple[float, float, float] = (0, 0, 0),
 ) -> Path:
     """A COLMAP scene with five points that every 32×24 picture sees; `old` leaves rigs and frames away."""
-    from gsencoder.data.readers.undistort import load_pycolmap
+    from gsencoder.data.readers.posed import load_pycolmap
 
     pycolmap = load_pycolmap()
     made = pycolmap.Reconstruction()

@@ -10,10 +10,20 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from splats import random_cameras
 
-from gsencoder.data.readers.undistort import load_pycolmap
+from gsencoder.data.readers.posed import load_pycolmap
 from gsencoder.types import Cameras
-from gsencoder.types.checks import invert_rigid, look_at, look_rotation, move_origin, perpendicular, transform
-from gsencoder.types.scene import intrinsic_matrix, pixel_centers, project_points, unproject_points
+from gsencoder.types.scene import (
+    intrinsic_matrix,
+    invert_rigid,
+    look_at,
+    look_rotation,
+    move_origin,
+    perpendicular,
+    pixel_centers,
+    project_points,
+    transform,
+    unproject_points,
+)
 
 EXTREME = (1e-6, 1.0, 1e6, 1e12)
 """Lengths at which laws must hold alike."""

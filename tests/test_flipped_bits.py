@@ -50,7 +50,8 @@ from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers
 from gsencoder.models.encoder import load_weights, save_weights
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
-from gsencoder.reconstruct.parameters import RowAdam, State, anchor_at, load_state, parameters_from, save_state
+from gsencoder.reconstruct.optimize import RowAdam, anchor_at, parameters_from
+from gsencoder.reconstruct.run import State, load_state, save_state
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.prepared import CLASS_BALANCE_FILE, SPACE_FILE

@@ -15,7 +15,7 @@ from gsencoder.data.labels.files import read_checked
 from gsencoder.data.labels.mesh import read_mesh
 from gsencoder.data.readers.colmap import read_colmap
 from gsencoder.data.readers.images import load_npy, open_picture
-from gsencoder.data.readers.label_images import table_lines
+from gsencoder.data.readers.posed import table_lines
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.splats.files import load_property, load_splat
 from gsencoder.data.splats.ply import read_points

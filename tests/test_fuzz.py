@@ -10,7 +10,7 @@ import pytest
 import test_flipped_bits
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.files import read_whole_numbers
+from gsencoder.data.labels.files import read_integer_lines
 from gsencoder.evaluate.benchmarks.instances import read_instance_prediction
 from gsencoder.infer.ask.questions import read_questions
 
@@ -67,9 +67,9 @@ def test_a_mask_with_an_endless_name_is_refused_in_a_short_line(tmp_path: Path) 
 def test_a_number_of_thousands_of_digits_is_refused_and_one_of_zeros_is_none(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("1\n" + "4" * 5000 + "\n")
     with pytest.raises(InputError, match="line 2: expected one whole number, got '4{40}'$"):
-        read_whole_numbers(tmp_path / "a.txt")
+        read_integer_lines(tmp_path / "a.txt")
     (tmp_path / "a.txt").write_text("0" * 5000 + "7\n")
-    assert read_whole_numbers(tmp_path / "a.txt").tolist() == [7]
+    assert read_integer_lines(tmp_path / "a.txt").tolist() == [7]
 
 
 @pytest.mark.parametrize("name", ["q" * 5000, "que\nry"])

@@ -9,7 +9,7 @@ from PIL import Image
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.types import Cameras, Views
-from gsencoder.types.checks import OPENCV_FROM_OPENGL
+from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 HALF = np.array([2.0, 2.5, 1.4])
 """Half of the box's sides, meters; z is up."""

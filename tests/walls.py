@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 
 from gsencoder.data.photographs import Photographs
-from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
-from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.data.seeding.depth import seed_from_depth
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig, RowAdam, parameters_from
 from gsencoder.types import Cameras, Gaussians, Views
 
 DEPTH, TILT = 3.0, 0.3

@@ -16,10 +16,9 @@ from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.check.agreement import SAMPLES, depth_views
-from gsencoder.data.seeding.points import fit_axes
+from gsencoder.data.seeding.depth import fit_axes
 from gsencoder.types import Gaussians, Views
-from gsencoder.types.checks import invert_rigid, transform
-from gsencoder.types.scene import unproject_points
+from gsencoder.types.scene import invert_rigid, transform, unproject_points
 
 MAX_SAMPLES = 20_000  # Gaussians that are looked at
 FLATTENED = 0.5  # Gaussians whose thinnest axis is above this share of the middle one have no normal
@@ -39,11 +38,11 @@ class Surfaces(NamedTuple):
     rest: float = 0.0  # area of what has no normal, in the same unit; it lowers the confidence of an estimate
 
 
-def surfaces_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
+def surfaces_of_gaussians(gaussians: Gaussians) -> Surfaces:
     """A random choice of the flat Gaussians; areas are times opacity."""
     from scipy.spatial.transform import Rotation
 
-    rows = np.random.default_rng(seed).permutation(len(gaussians))[: 4 * MAX_SAMPLES]
+    rows = np.random.default_rng(0).permutation(len(gaussians))[: 4 * MAX_SAMPLES]
     scales = gaussians.scales[rows].astype(np.float64)
     order = np.argsort(scales, axis=1)
     ordered = np.take_along_axis(scales, order, axis=1)
@@ -57,12 +56,12 @@ def surfaces_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
     return Surfaces(gaussians.means[rows].astype(np.float64), normals, areas)
 
 
-def planes_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
+def planes_of_gaussians(gaussians: Gaussians) -> Surfaces:
     """Planes through the neighbors of randomly chosen means; areas are squared distances to the last neighbor."""
     from scipy.spatial import cKDTree
 
     opaque = np.flatnonzero(gaussians.opacities >= MIN_OPACITY)
-    opaque = np.random.default_rng(seed).permutation(opaque)[:MAX_PLANE_MEANS]
+    opaque = np.random.default_rng(0).permutation(opaque)[:MAX_PLANE_MEANS]
     if len(opaque) < PLANE_NEIGHBORS:
         return Surfaces(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     means = gaussians.means[opaque].astype(np.float64)
@@ -77,17 +76,13 @@ def planes_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
     return Surfaces(means[:MAX_SAMPLES][flat], axes[flat, :, 0], areas[flat], float(areas[~flat].sum()))
 
 
-def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfaces:
-    """Samples of the surfaces that depth images show.
-
-    Args:
-        limit: largest number of views to look at, evenly spaced.
-    """
+def surfaces_of_depth(views: Views) -> Surfaces:
+    """Samples of the surfaces that 16 of the depth images show, evenly spaced."""
     # Its kernels load numba, which a scene that states its up does without.
     from gsencoder.data.seeding.depth import surface_pixels
 
-    depth = depth_views(views, even_indices(len(views), limit), seed=seed)
-    rng = np.random.default_rng(seed)
+    depth = depth_views(views, even_indices(len(views), 16))
+    rng = np.random.default_rng(0)
     world_from_cam = invert_rigid(depth.cam_from_world)
     parts = []
     for view in range(len(depth)):
@@ -228,8 +223,7 @@ def _surface_areas(gaussians: Gaussians) -> Float64[np.ndarray, "x y z"]:
 
 
 def _frame(gaussians: Gaussians, means: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The axes, as rows, of the grid: those of the walls, those in which the means spread most, or the world's,
-    whichever give the smallest box."""
+    """The axes of the grid, as rows: of the walls, of the largest spread, or the world's, by the smallest box."""
     from scipy.spatial.transform import Rotation
 
     means = means[even_indices(len(means), MAX_FRAME_MEANS)]
@@ -241,8 +235,7 @@ def _frame(gaussians: Gaussians, means: Float64[np.ndarray, "n 3"]) -> Float64[n
 
 
 def _slices(direction: tuple[int, ...], *grids: np.ndarray) -> Iterator[tuple[tuple[int, int], list[np.ndarray]]]:
-    """Slices of grids across an axis of the direction, the one that rays reach last first; each with the step within
-    slices to the next cell of a ray."""
+    """Slices of grids across an axis, last to be reached first, with a ray's step within slices to the next."""
     axis = next(number for number in range(3) if direction[number])
     across = [direction[number] for number in range(3) if number != axis]
     moved = [np.moveaxis(grid, axis, 0) for grid in grids]
@@ -271,8 +264,7 @@ def _blocked(surface: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "x y z"]:
 
 
 def _entering_again(surface: Bool[np.ndarray, "x y z"], space: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "x y z"]:
-    """The number of directions in which a ray from each free cell meets a surface, and `space` right behind it;
-    of cells in a surface it means nothing."""
+    """For each free cell the number of directions in which a ray meets a surface with `space` right behind it."""
     count = np.zeros(surface.shape, np.int64)
     for direction in DIRECTIONS:
         ahead = None

@@ -8,8 +8,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.types import Cameras, Gaussians
-from gsencoder.types.checks import look_at, perpendicular
-from gsencoder.types.scene import intrinsic_matrix
+from gsencoder.types.scene import intrinsic_matrix, look_at, perpendicular
 
 CamerasOfSplat = Literal["auto", "around", "inside"]
 """Where cameras of a splat without views stand; "auto" = inside a room (`gsencoder.fusion.cameras`)."""

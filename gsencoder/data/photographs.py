@@ -26,14 +26,6 @@ class ScaledPhotograph:
     # Pixels in which nothing is to be seen; None = nothing is known to be empty.
     empty: Bool[Tensor, "H W"] | None = None
 
-    @property
-    def width(self) -> int:
-        return self.image.shape[1]
-
-    @property
-    def height(self) -> int:
-        return self.image.shape[0]
-
 
 class Photographs:
     """Views of a scene as tensors: photographs as bytes, masks, and depth in float32.
@@ -41,6 +33,8 @@ class Photographs:
     Attributes:
         cameras: of all views, at full size.
         orientations: of all views, EXIF's; 1 = upright.
+        masks: pixels of each photograph that count; None where all do.
+        empty: pixels of each in which nothing is to be seen; None where nothing is known to be empty.
     """
 
     def __init__(self, views: Views, *, track: Track = untracked) -> None:
@@ -49,17 +43,17 @@ class Photographs:
             raise InputError("the scene has cameras but no photographs")
         self.cameras: Cameras = views.cameras
         self.names = views.names
-        self.orientations = views.orientations or (1,) * len(views)
+        self.orientations = views.orientations or (1,) * len(self.names)
         self._images: list[Tensor] = []
-        self._masks: list[Tensor | None] = []
-        self._empty: list[Tensor | None] = []
+        self.masks: list[Tensor | None] = []
+        self.empty: list[Tensor | None] = []
         self._depths: list[Tensor | None] = []
-        for view in track(range(len(views)), "reading photographs"):
+        for view in track(range(len(self.names)), "reading photographs"):
             self._images.append(torch.from_numpy(np.ascontiguousarray(views.images[view])))
             mask = None if views.masks is None else torch.from_numpy(np.ascontiguousarray(views.masks[view]))
-            self._masks.append(None if mask is None or bool(mask.all()) else mask)
+            self.masks.append(None if mask is None or bool(mask.all()) else mask)
             empty = None if views.empty is None else torch.from_numpy(np.ascontiguousarray(views.empty[view]))
-            self._empty.append(None if empty is None or not bool(empty.any()) else empty)
+            self.empty.append(None if empty is None or not bool(empty.any()) else empty)
             self._depths.append(None if views.depths is None else torch.from_numpy(views.depths[view].copy()))
 
     def __len__(self) -> int:
@@ -69,23 +63,15 @@ class Photographs:
         """A digest of photographs, masks, depths and poses."""
         digest = sha1()
         arrays = [getattr(self.cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights")]
-        lists: list[Sequence[Tensor | None]] = [self._images, self._masks, self._depths]
-        if any(empty is not None for empty in self._empty):
-            lists.append(self._empty)
+        lists: list[Sequence[Tensor | None]] = [self._images, self.masks, self._depths]
+        if any(empty is not None for empty in self.empty):
+            lists.append(self.empty)
         for part in itertools.chain(*lists):
             arrays.append(np.empty(0) if part is None else part.numpy())
         for name, array in zip((*"ptwh", *len(lists) * self.names), arrays, strict=True):
             digest.update(f"{name}{array.shape}{array.dtype}".encode())
             digest.update(np.ascontiguousarray(array).data)
         return digest.hexdigest()[:16]
-
-    def mask(self, view: int) -> Bool[Tensor, "H W"] | None:
-        """Pixels of a photograph that count; None where all do."""
-        return self._masks[view]
-
-    def empty(self, view: int) -> Bool[Tensor, "H W"] | None:
-        """Pixels of a photograph in which nothing is to be seen; None where nothing is known to be empty."""
-        return self._empty[view]
 
     def at_scale(self, view: int, shrink: int = 1) -> ScaledPhotograph:
         """A view; each of its pixels stands for `shrink` × `shrink` of the photograph's.
@@ -94,7 +80,7 @@ class Photographs:
         covers differ by less than 5 %. Lines and columns that do not fill a pixel are left out.
         """
         image = self._images[view].float() / 255
-        mask, empty, depth = self._masks[view], self._empty[view], self._depths[view]
+        mask, empty, depth = self.masks[view], self.empty[view], self._depths[view]
         K = torch.from_numpy(self.cameras.Ks[view].copy())
         if shrink > 1:
             image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), shrink).permute(1, 2, 0).contiguous()

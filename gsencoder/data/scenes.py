@@ -2,16 +2,15 @@
 
 import json
 import math
-import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
@@ -23,39 +22,177 @@ from gsencoder.data.labels.scans import (
     with_archived_instances,
     with_mesh_instances,
 )
-from gsencoder.data.readers.depth_images import DepthFiles
+from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
 from gsencoder.data.readers.images import (
+    DepthFiles,
     ImageFiles,
-    PixelGrid,
-    picture_info,
-    picture_size,
+    have_empty_pixels,
     pinhole_of,
+    pixel_grids,
 )
-from gsencoder.data.readers.label_images import LabelFiles
-from gsencoder.data.readers.layouts import (
-    SPLAT_SUFFIXES,
-    describe_layouts,
-    find_splat,
-    layout_of,
-    read_bare_splat,
-    warn_of_unused_splat,
-)
-from gsencoder.data.readers.masks import MaskFiles, find_background
+from gsencoder.data.readers.masks import LabelFiles, MaskFiles, find_background
 from gsencoder.data.readers.posed import (
     MAX_COORDINATE,
+    CameraModel,
     DepthMeasure,
     PosedImage,
     PosedImages,
     ReadOptions,
+    check_camera,
     choose_origin,
+    pinhole_for,
     rigid_pose,
 )
-from gsencoder.data.readers.transforms_json import TRANSFORMS, read_objects, read_transforms
-from gsencoder.data.readers.undistort import CameraModel, pinhole_for, remap_between
-from gsencoder.data.splats.files import load_splat
-from gsencoder.types import Cameras, Scene, Views
-from gsencoder.types.checks import invert_rigid, move_origin
-from gsencoder.types.orientation import EXCHANGED, INVERSE, UNMIRRORED
+from gsencoder.data.readers.rgbd import (
+    is_replica,
+    is_scannet_export,
+    is_scannetpp,
+    is_seven_scenes,
+    is_tum,
+    read_replica,
+    read_scannet,
+    read_scannetpp,
+    read_seven_scenes,
+    read_tum,
+)
+from gsencoder.data.readers.transforms_json import TRANSFORMS, read_transforms
+from gsencoder.data.splats.files import gaussians_from_raw, is_ply_of_splat, load_splat, read_raw
+from gsencoder.data.video import refuse_video
+from gsencoder.types import Cameras, Gaussians, Scene, Views
+from gsencoder.types.orientation import UNMIRRORED
+from gsencoder.types.scene import invert_rigid, move_origin
+
+MASKS = "masks"
+COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
+
+
+class Layout(NamedTuple):
+    """One way in which scenes are stored."""
+
+    name: str
+    files: str  # what is recognized, for people
+    matches: Callable[[Path], bool]
+    # The posed images of a folder, and the folder of the scene.
+    read: Callable[[Path, ReadOptions], tuple[PosedImages, Path]]
+
+
+def transforms_in(root: Path) -> Path | None:
+    return next((root / file for file in TRANSFORMS if (root / file).is_file()), None)
+
+
+def colmap_model_in(root: Path) -> Path | None:
+    return next((root / file for file in COLMAP_FOLDERS if is_colmap_model(root / file)), None)
+
+
+def _read_transforms(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
+    transforms, model = transforms_in(root), colmap_model_in(root)
+    assert transforms is not None
+    if model is not None and not str(model.relative_to(root)).startswith("colmap"):
+        _warn(f"{root}: holds {transforms.name} and a COLMAP model; {transforms.name} is used (give {model} instead)")
+    return read_transforms(transforms, options), root
+
+
+def _read_colmap(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
+    model = colmap_model_in(root)
+    assert model is not None
+    if model.name == "0" and model != root:
+        others = sorted(path.name for path in model.parent.iterdir() if path != model and is_colmap_model(path))
+        if others:
+            names = ", ".join(others)
+            _warn(f"{model.parent}: holds {1 + len(others)} models; 0 is used (or give the folder of {names})")
+    if options.images:
+        images = Path(options.images)
+        images = images if images.is_absolute() or images.is_dir() else root / images
+        if not images.is_dir():
+            raise InputError(f"images={options.images}: no such folder (looked from here and in {root})")
+        # A folder that the user names may be read.
+        masks = next((home / MASKS for home in (root, images.parent) if (home / MASKS).is_dir()), None)
+        return read_colmap(model, images, images, options, masks=masks), root
+    homes = [root, root.parent, root.parent.parent] if model == root else [root]
+    home = next((home for home in homes if (home / "images").is_dir()), None)
+    if home is None:
+        searched = ", ".join(str(home / "images") for home in homes)
+        raise InputError(f"{model}: a COLMAP model without photographs; looked for {searched}; say images=FOLDER")
+    return read_colmap(model, home / "images", home, options, masks=home / MASKS), home
+
+
+def _at_root(
+    reader: Callable[[Path, ReadOptions], PosedImages],
+) -> Callable[[Path, ReadOptions], tuple[PosedImages, Path]]:
+    return lambda root, options: (reader(root, options), root)
+
+
+LAYOUTS = (
+    Layout(
+        "transforms.json",
+        f"{' or '.join(TRANSFORMS)} (nerfstudio, instant-ngp, Blender)",
+        lambda root: transforms_in(root) is not None,
+        _read_transforms,
+    ),
+    Layout(
+        "COLMAP",
+        "sparse/0 or sparse with a COLMAP model, and images/",
+        lambda root: colmap_model_in(root) is not None,
+        _read_colmap,
+    ),
+    Layout(
+        "ScanNet++",
+        "dslr/ or iphone/ of ScanNet++ (frames extracted to iphone/rgb)",
+        is_scannetpp,
+        _at_root(read_scannetpp),
+    ),
+    Layout("ScanNet", "color/, pose/, depth/ and intrinsic/ of ScanNet", is_scannet_export, _at_root(read_scannet)),
+    Layout(
+        "7-Scenes",
+        "frame-NNNNNN.color.png, .depth.png and .pose.txt of 7-Scenes",
+        is_seven_scenes,
+        _at_root(read_seven_scenes),
+    ),
+    Layout("TUM RGB-D", "rgb.txt, depth.txt and groundtruth.txt of TUM RGB-D", is_tum, _at_root(read_tum)),
+    Layout("Replica", "results/ and traj.txt of Replica (NICE-SLAM)", is_replica, _at_root(read_replica)),
+)
+
+
+def layout_of(folder: Path) -> Layout | None:
+    return next((layout for layout in LAYOUTS if layout.matches(folder)), None)
+
+
+def describe_layouts() -> str:
+    return f"a scene holds one of: {'; '.join(layout.files for layout in LAYOUTS)}; a splat"
+
+
+SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog")
+SPLAT_NAMES = ("splat.ply", "point_cloud.ply")  # What a reconstruction that lies with its photographs is called
+
+
+def find_splat(root: Path) -> Path:
+    """The splat that `root` is or holds."""
+    if root.is_file():
+        if root.suffix.lower() in SPLAT_SUFFIXES or root.name == "meta.json":
+            return root
+        refuse_video(root)
+        raise InputError(f"{root}: expected a transforms.json or a splat ({', '.join(SPLAT_SUFFIXES)})")
+    if (root / "meta.json").is_file():
+        return root
+    files = sorted(path for path in root.iterdir() if path.is_file() and path.suffix.lower() in SPLAT_SUFFIXES)
+    splats = [path for path in files if path.suffix.lower() != ".ply" or is_ply_of_splat(path)]
+    if len(splats) == 1 or len(files) == 1:
+        return (splats or files)[0]
+    if files and not splats:
+        raise InputError(f"{root}: holds {len(files)} .ply files, meshes or points, and no splat and no views")
+    if splats:
+        names = ", ".join(path.name for path in splats[:5])
+        raise InputError(f"{root}: holds {len(splats)} splats ({names}) and no views; give one of them")
+    raise InputError(f"{root}: not a scene; {describe_layouts()}")
+
+
+def read_bare_splat(path: Path) -> tuple[Gaussians, Float64[np.ndarray, "3"]]:
+    """A splat without views, and an origin near the median of its means, taken off before they become float32."""
+    raw = read_raw(path)
+    finite = raw.means[np.isfinite(raw.means).all(axis=1)]
+    origin = choose_origin(np.median(finite, axis=0, keepdims=True)) if len(finite) else np.zeros(3)
+    return gaussians_from_raw(raw, origin=origin, where=str(path)), origin
+
 
 FEATURES_FILE = "scene.safetensors"  # The file by which a folder of features, or of a memory of a scene, is recognized
 
@@ -202,7 +339,6 @@ def _kind_of_folder(folder: Path) -> str:
     return "a folder of other files"
 
 
-FEW_CAMERAS = 8
 MEASURED = 0.05  # Where depth was measured on a larger share of it, what looks like a background is a wall
 
 
@@ -222,27 +358,13 @@ def make_views(
     cam_from_world = np.stack([image.cam_from_world for image in images])
     origin = choose_origin(invert_rigid(cam_from_world)[:, :3, 3])
     pinholes: dict[CameraModel, CameraModel] = {}
-    grids, depth_grids = [], []
-    transparent: list[Path | None] = []
-    orientations: list[int] = []
     for image in images:
         where = f"{posed.source}: view {image.name[:120]!r}"
         if image.camera not in pinholes:
             pinholes[image.camera] = pinhole_for(image.camera, where)
-        pinhole = pinholes[image.camera]
-        width = max(1, round(pinhole.width * image_scale))
-        height = max(1, round(pinhole.height * image_scale))
-        size, is_transparent, orientation = picture_info(image.image)
-        # A photograph that is stored sideways, with the camera of the upright picture, is turned on load. With the
-        # camera of its stored pixels it is not, and a mask whose sides are exchanged belongs to the upright picture.
-        camera_size = image.camera.width, image.camera.height
-        exchanged = orientation in EXCHANGED and size[::-1] == camera_size != size
-        turn = orientation if exchanged else INVERSE[orientation]
-        orientations.append(1 if exchanged else orientation)
-        grids.append(PixelGrid(source=image.camera, pinhole=pinhole, width=width, height=height, turn=turn))
-        depth_grids.append(replace(grids[-1], source=image.depth_camera or image.camera))
-        _check_sizes(image, grids[-1], depth_grids[-1], size, where)
-        transparent.append(image.image if is_transparent else None)
+        if image.depth_camera is not None:
+            check_camera(image.depth_camera, f"{where}: depth")
+    grids, depth_grids, transparent, orientations = pixel_grids(images, pinholes, image_scale, posed.source)
     cameras = Cameras(
         cam_from_world=move_origin(cam_from_world, origin).astype(np.float32),
         Ks=np.array([grid.pinhole.matrix(grid.width, grid.height) for grid in grids]).astype(np.float32),
@@ -251,22 +373,21 @@ def make_views(
     )
     masks = [image.mask for image in images]
     instances = [image.instance for image in images]
-    partial = _have_empty_pixels({(grid.pinhole, grid.source, grid.reduction) for grid in grids})
+    partial = have_empty_pixels(grids)
     background = None
     # A fisheye picture may be a disc in a black frame.
-    is_plain = not (_any(masks) or _any(transparent) or any("FISHEYE" in image.camera.model for image in images))
+    is_plain = not (any(masks) or any(transparent) or any("FISHEYE" in image.camera.model for image in images))
     if mask_background and is_plain:
         background = find_background([image.image for image in images])
     outlined = transparent if background is None else [image.image for image in images]
-    has_outlines = _any(outlined)
     views = Views(
         cameras=cameras,
         names=tuple(image.name for image in images),
         images=ImageFiles([image.image for image in images], grids),
-        depths=DepthFiles(images, depth_grids) if _any([image.depth for image in images]) else None,
-        masks=MaskFiles(masks, grids, outlined, background) if _any(masks) or has_outlines or partial else None,
-        empty=MaskFiles(masks, grids, outlined, background, empty=True) if has_outlines else None,
-        instances=LabelFiles(instances, grids) if _any(instances) else None,
+        depths=DepthFiles(images, depth_grids) if any(image.depth for image in images) else None,
+        masks=MaskFiles(masks, grids, outlined, background) if any(masks) or any(outlined) or partial else None,
+        empty=MaskFiles(masks, grids, outlined, background, empty=True) if any(outlined) else None,
+        instances=LabelFiles(instances, grids) if any(instances) else None,
         orientations=tuple(orientations) if max(orientations) > 1 else None,
     )
     mirrored = sum(UNMIRRORED[orientation] != orientation for orientation in orientations)
@@ -292,35 +413,6 @@ def _is_measured(views: Views) -> bool:
     rows = even_indices(len(views), 4)
     shares = [float((views.depths[int(row)][views.empty[int(row)]] > 0).mean()) for row in rows]
     return float(np.nan_to_num(shares).mean()) > MEASURED
-
-
-def _any(paths: Sequence[Path | None]) -> bool:
-    return any(path is not None for path in paths)
-
-
-def _check_sizes(image: PosedImage, grid: PixelGrid, depth_grid: PixelGrid, size: tuple[int, int], where: str) -> None:
-    """Checks the sizes in the headers of the files; `size` is the photograph's."""
-    camera = image.camera
-    if image.depth is not None and image.depth == image.image:
-        raise InputError(f"{where}: {image.image} is listed as photograph and as depth image; list the photograph")
-    if (size[::-1] if grid.is_exchanged(*size) else size) != (camera.width, camera.height):
-        raise InputError(
-            f"{where}: {image.image} has {size[0]}×{size[1]} pixels but its camera {camera.width}×{camera.height}"
-        )
-    for file, expected in ((image.depth, depth_grid), (image.mask, grid), (image.instance, grid)):
-        if file is not None and not expected.fits(*(actual := picture_size(file))):
-            raise InputError(
-                f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}"
-            )
-
-
-def _have_empty_pixels(cameras: set[tuple[CameraModel, CameraModel, int]]) -> bool:
-    """Whether some pixel of a pinhole camera is outside the distorted picture."""
-    distorted = [camera for camera in cameras if not camera[1].is_pinhole]
-    if len(distorted) > FEW_CAMERAS:
-        return True
-    maps = [remap_between(*camera) for camera in distorted]
-    return any(remap is not None and not remap.valid.all() for remap in maps)
 
 
 def _warn(message: str) -> None:
@@ -373,7 +465,7 @@ class SceneConfig:
 def load_scene(path: str | Path, *, splat: str | Path | None = None, options: SceneConfig = SceneConfig()) -> Scene:
     """Reads a scene; of pictures the size is read now, and they are decoded on access.
 
-    Recognized, in this order: the layouts of `gsencoder.data.readers.layouts` (transforms.json, COLMAP, ScanNet++,
+    Recognized, in this order: the layouts of `gsencoder.data.scenes` (transforms.json, COLMAP, ScanNet++,
     ScanNet, 7-Scenes, TUM RGB-D, Replica), a splat file, or a folder with one splat file or an unpacked .sog.
 
     Cameras and Gaussians are relative to `Scene.origin`: the mean of the camera centers (for a bare splat the median
@@ -422,18 +514,23 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         mask_background=options.background == "auto",
     )
     gaussians = load_splat(file_of_scene("splat", splat, folder), origin=origin) if splat is not None else None
-    if splat is None:
-        warn_of_unused_splat(folder)
-    objects_file = folder / "objects.json"
-    beside_transforms = root.suffix.lower() == ".json" or any((folder / file).is_file() for file in TRANSFORMS)
-    objects = read_objects(objects_file) if beside_transforms and os.path.lexists(objects_file) else ()
-    labels = labels_of_layout(folder, layout)
+    left_over = [name for name in SPLAT_NAMES if splat is None and (folder / name).is_file()]
+    if left_over:
+        advice = f"say splat={left_over[0]} if it belongs to them"
+        _warn(f"{folder}: {left_over[0]} lies with the views and is not used; {advice}")
+    objects = posed.objects
+    labels = labels_of_layout(folder, layout) if layout in ("ScanNet", "ScanNet++") else None
     if labels is not None:
         if layout == "ScanNet":
             views = with_archived_instances(views, folder)
         views = with_mesh_instances(views, labels, origin)
         objects = objects_of_labels(labels)
-    points, colors = _finite_points(posed)
+    points, colors = posed.points, posed.colors
+    with np.errstate(invalid="ignore"):
+        finite = np.abs(points).max(axis=1, initial=0) <= MAX_COORDINATE
+    if not finite.all():
+        _warn(f"{posed.source}: {int((~finite).sum())} of {len(finite)} points are not finite and are left out")
+        points, colors = points[finite], colors[finite] if len(colors) else colors
     return Scene(
         name=name_of_folder(folder),
         gaussians=gaussians,
@@ -446,16 +543,6 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         sfm_colors=colors if len(colors) else None,
         folder=folder,
     )
-
-
-def _finite_points(posed: PosedImages) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "_ 3"]]:
-    """The points that are finite, and their colors if they have any."""
-    with np.errstate(invalid="ignore"):
-        good = np.abs(posed.points).max(axis=1, initial=0) <= MAX_COORDINATE
-    if not good.all():
-        message = f"{int((~good).sum())} of {len(good)} points are not finite and are left out"
-        warnings.warn(f"{posed.source}: {message}", SceneWarning, stacklevel=3)
-    return posed.points[good], posed.colors[good] if len(posed.colors) else posed.colors
 
 
 def _unit(direction: tuple[float, float, float] | None) -> Float64[np.ndarray, "3"] | None:
@@ -479,11 +566,11 @@ def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedI
             return None, root, "splat"
         name = layout.name
         posed, folder = layout.read(root, read_options)
-    images = tuple(_with_given_sensors(image, options) for image in posed.images)
+    images = tuple(_override_sensors(image, options) for image in posed.images)
     return replace(posed, images=images), folder, name
 
 
-def _with_given_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
+def _override_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
     """A view with the intrinsics and the depth sensor that the user gives."""
     if options.intrinsics is not None:
         fx, fy, cx, cy = options.intrinsics

@@ -15,7 +15,7 @@ from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.seeding.points import OPACITY, SIZE, THICKNESS, quats_from_normals
 from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views, sh_from_colors
-from gsencoder.types.checks import OPENCV_FROM_OPENGL
+from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

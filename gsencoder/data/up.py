@@ -211,8 +211,7 @@ def _upright_axis(
     normals: Float64[np.ndarray, "n 3"],
     areas: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "3"]:
-    """Of the three axes of a Manhattan world and their opposites, the one with the largest floor; see
-    `NEAR_USUAL_WEIGHT`."""
+    """Of the axes of a Manhattan world, both ways, the one with the largest floor; see `NEAR_USUAL_WEIGHT`."""
     across = np.linalg.svd(direction[None])[2][1:]
     turns = np.deg2rad(np.arange(0, 90, 3.0))
     circle = np.cos(turns)[:, None] * across[0] + np.sin(turns)[:, None] * across[1]

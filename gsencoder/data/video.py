@@ -179,7 +179,7 @@ class Video:
         return container
 
     def frames(self) -> Iterator[Any]:
-        """All frames, as PyAV's VideoFrame, in the order in which they are shown. Where decoding fails they end, and
+        """All frames, as PyAV's VideoFrame, in the order of display. Where decoding fails they end, and
         `failure` says why."""
         self.failure, self.decoded, empty = None, 0.0, True
         with self._open() as container:

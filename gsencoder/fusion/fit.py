@@ -21,10 +21,9 @@ from scipy.spatial.transform import Rotation
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import file_of_scene
-from gsencoder.data.readers.layouts import transforms_in
 from gsencoder.data.readers.posed import rigid_pose
 from gsencoder.data.readers.transforms_json import read_json
-from gsencoder.data.scenes import SceneConfig
+from gsencoder.data.scenes import SceneConfig, transforms_in
 from gsencoder.geometry import colors_from_sh
 from gsencoder.render import blend
 from gsencoder.types import Cameras, Gaussians, Scene, Views

@@ -15,8 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
 from gsencoder.types import Box, Localization, Scene
-from gsencoder.types.checks import transform
-from gsencoder.types.scene import project_points
+from gsencoder.types.scene import project_points, transform
 
 EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1], np.int32)
 """The 12 edges of a box whose corner k lies at the upper end of axis d where bit d of k is set."""

@@ -24,7 +24,7 @@ from gsencoder.infer.relevancy import Cluster, Evidence, Presence, ThresholdConf
 from gsencoder.text.table import TextEncoder, TextTable, check_space
 from gsencoder.text.vocabulary import OpenVocabulary, closed_table
 from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scene
-from gsencoder.types.checks import perpendicular
+from gsencoder.types.scene import perpendicular
 
 Extent = Literal["means", "sigma"]
 NEGATIVES = ("object", "things", "stuff", "texture")

@@ -1,40 +1,273 @@
-"""Optimization of a splat against photographs: L1 + D-SSIM, a depth loss where depth was measured, pruning, and no
+"""What is optimized, and how: a splat with logarithms of scales and logits of opacities, what holds its positions, and
+the colors of each photograph. L1 + D-SSIM against photographs, a depth loss where depth was measured, pruning, and no
 densification.
 """
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import defer_signals
 from gsencoder.core.settings import check_limits, option
+from gsencoder.core.threads import PIECES, kernel, parallel
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
-from gsencoder.reconstruct.parameters import (
-    ROUNDS,
-    Anchor,
-    Exposures,
-    Parameters,
-    RowAdam,
-    State,
-    apply_colors,
-    camera_of,
-    compared_pixels,
-    fitted_colors,
-    gaussians_of,
-    rows_in_view,
-    seen_colors,
-)
+from gsencoder.geometry import colors_from_sh, normalize_quats, project_points, transform
+from gsencoder.render.images import IDENTITY, apply_colors, compared_pixels, fitted_colors, ssim
 from gsencoder.render.images import WINDOW as SSIM_WINDOW
-from gsencoder.render.images import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Cameras, Gaussians
+
+OPACITY_MARGIN = 1e-3
+"""Opacities begin at least this far from 0 and 1, where a logit has no slope."""
+MAX_SIGMAS = 3.33
+"""No splat reaches further than this many standard deviations: √(2 ln 255) at an opacity of 1."""
+
+Parameters = dict[str, Tensor]
+"""means [N, 3], quats [N, 4], log_scales [N, 3], logit_opacities [N], sh0 [N, 1, 3], shN [N, K − 1, 3], float32."""
+
+
+def parameters_from(gaussians: Gaussians, sh_degree: int, device: torch.device | str = "cpu") -> Parameters:
+    """The parameters of a splat; color coefficients that it lacks begin at zero, more are cut."""
+    n, num_coefficients = len(gaussians), (sh_degree + 1) ** 2
+    sh = np.zeros((n, num_coefficients, 3), np.float32)
+    common = min(num_coefficients, gaussians.sh.shape[1])
+    sh[:, :common] = gaussians.sh[:, :common]
+    opacities = torch.from_numpy(gaussians.opacities.copy()).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    raw = {
+        "means": torch.from_numpy(gaussians.means.copy()),
+        "quats": torch.from_numpy(gaussians.quats.copy()),
+        "log_scales": torch.from_numpy(gaussians.scales).log(),
+        "logit_opacities": torch.logit(opacities),
+        "sh0": torch.from_numpy(sh[:, :1].copy()),
+        "shN": torch.from_numpy(sh[:, 1:].copy()),
+    }
+    return {name: value.to(device) for name, value in raw.items()}
+
+
+def gaussians_of(raw: Parameters) -> Gaussians:
+    """The splat in physical values."""
+    values = {
+        "means": raw["means"],
+        "quats": normalize_quats(raw["quats"]),
+        "scales": raw["log_scales"].exp(),
+        "opacities": raw["logit_opacities"].sigmoid(),
+        "sh": torch.cat((raw["sh0"], raw["shN"]), dim=1),
+    }
+    return Gaussians(**{name: value.detach().cpu().numpy().copy() for name, value in values.items()})
+
+
+def seen_colors(raw: Parameters, degree: int, camera_center: Float[Tensor, "3"]) -> Float[Tensor, "N 3"]:
+    """Colors from a camera with coefficients up to `degree`."""
+    sh = torch.cat((raw["sh0"], raw["shN"][:, : (degree + 1) ** 2 - 1]), dim=1) if degree else raw["sh0"]
+    return colors_from_sh(sh, raw["means"], camera_center)
+
+
+def rows_in_view(
+    raw: Parameters,
+    cam_from_world: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+    width: int,
+    height: int,
+    *,
+    near: float,
+    eps2d: float,
+) -> Int64[Tensor, " n"]:
+    """Rows that may touch the image: all that do, and few others.
+
+    A splat's half width is at most REACH·√((f·s/z)²(1 + t²) + eps2d), where s is its largest scale and t the tangent
+    at which geometry.project stops following it sideways.
+    """
+    local = transform(cam_from_world, raw["means"])
+    z = local[:, 2]
+    inside: Bool[Tensor, " N"] = z > near
+    largest = raw["log_scales"].amax(dim=1).exp() / z.clamp(min=near)
+    focals, middles, sizes = K.diagonal()[:2], K[:2, 2], (width, height)
+    for position, focal, middle, size in zip(project_points(local, K).unbind(1), focals, middles, sizes, strict=True):
+        tangent = torch.maximum(middle, size - middle) / focal + 0.15 * size / focal
+        reach = MAX_SIGMAS * torch.sqrt((focal * largest).square() * (1 + tangent.square()) + eps2d)
+        inside &= (position + reach > 0) & (position - reach < size)
+    return inside.nonzero().squeeze(1)
+
+
+def camera_of(cameras: Cameras, view: int, device: torch.device | str) -> tuple[Tensor, Tensor]:
+    """cam_from_world and center of a camera as float32 tensors; its K depends on how small the photograph is."""
+    center = torch.from_numpy(cameras.centers[view]).float()
+    return torch.from_numpy(cameras.cam_from_world[view].copy()).to(device), center.to(device)
+
+
+BETAS = (0.9, 0.999)
+EPS = 1e-15
+
+
+@kernel
+@no_type_check
+def _step(first, last, rows, grads, values, averages, squares, rate, correction, beta1, rest1, beta2, rest2, eps):
+    for k in range(first, last):
+        row, grad = rows[k], grads[k]
+        value, average, square = values[row], averages[row], squares[row]
+        for c in range(len(value)):
+            g = grad[c]
+            average[c] = beta1 * average[c] + rest1 * g
+            square[c] = beta2 * square[c] + rest2 * g * g
+            value[c] -= rate * average[c] / (np.sqrt(square[c]) * correction + eps)
+
+
+class RowAdam:
+    """Adam (Kingma & Ba 2015) over rows; as torch's SparseAdam, moments of rows that have no gradient do not decay.
+
+    Attributes:
+        parameters: float32 tensors of N rows each, stepped in place.
+        averages: first moments by parameter.
+        squares: second moments by parameter.
+    """
+
+    KINDS = ("parameters", "averages", "squares")  # Attributes that hold a tensor for each parameter
+
+    def __init__(self, parameters: Mapping[str, Tensor]) -> None:
+        self.parameters = dict(parameters)
+        self.averages = {name: torch.zeros_like(value) for name, value in parameters.items()}
+        self.squares = {name: torch.zeros_like(value) for name, value in parameters.items()}
+        self.steps = 0
+
+    @classmethod
+    def restored(cls, tables: Mapping[str, Mapping[str, Tensor]], steps: int) -> "RowAdam":
+        """One that goes on from the `tables` and steps of another."""
+        restored = cls(tables["parameters"])
+        restored.averages, restored.squares = dict(tables["averages"]), dict(tables["squares"])
+        restored.steps = steps
+        return restored
+
+    def step(self, rows: Int64[Tensor, " n"], grads: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
+        """One step of the rows that have gradients, which are distinct; `grads` are of these rows."""
+        self.steps += 1
+        first, second = (1 - beta**self.steps for beta in BETAS)
+        for name, grad in grads.items():
+            tables = (self.parameters[name], self.averages[name], self.squares[name])
+            rate, correction = rates[name] / first, second**-0.5
+            update = self._on_cpu if grad.device.type == "cpu" else self._plain
+            update(rows, grad, *tables, rate, correction)
+
+    @staticmethod
+    def _plain(
+        rows: Tensor, grad: Tensor, value: Tensor, average: Tensor, square: Tensor, rate: float, correction: float
+    ) -> None:
+        average[rows] = average[rows].lerp(grad, 1 - BETAS[0])
+        square[rows] = square[rows].lerp(grad * grad, 1 - BETAS[1])
+        value[rows] -= rate * average[rows] / (square[rows].sqrt() * correction + EPS)
+
+    @staticmethod
+    def _on_cpu(
+        rows: Tensor, grad: Tensor, value: Tensor, average: Tensor, square: Tensor, rate: float, correction: float
+    ) -> None:
+        tables = [array.reshape(len(array), -1).numpy() for array in (grad.contiguous(), value, average, square)]
+        # As numbers of the arrays' own type all arithmetic stays in it; 1 − 0.999 must be rounded once, and at the end.
+        first, second = BETAS
+        exact = (rate, correction, first, 1 - first, second, 1 - second, EPS)
+        numbers = [tables[0].dtype.type(number) for number in exact]
+        cuts = np.linspace(0, len(rows), PIECES + 1).astype(np.int64)
+        arrays = (rows.numpy(), *tables, *numbers)
+        parallel(lambda piece: _step(cuts[piece], cuts[piece + 1], *arrays), range(PIECES))
+
+    def keep(self, rows: Int64[Tensor, " n"]) -> None:
+        """Drops all rows but these, of parameters and moments."""
+        for table in (self.parameters, self.averages, self.squares):
+            for name, value in table.items():
+                table[name] = value[rows].contiguous()
+
+
+STEP = 0.5
+"""Share of the way to the best fit that a map moves at each step of its photograph."""
+SAME = 0.03
+"""Photographs of which no color channel differs by more from the mean do not count as differing in exposure."""
+ROUNDS = 3
+"""Number of steps of each photograph after which the maps, now seven eighths of the way to the fits, are compared."""
+
+
+class Exposures:
+    """An affine map of colors for each fitted photograph, relative to the mean of all: a camera that sets exposure and
+    white balance for every photograph shows one surface in several colors, which must not be explained by geometry or
+    by colors that depend on the direction.
+
+    The maps are not optimized by gradients, since each photograph is rendered too rarely for that: at each of its steps
+    its map moves halfway to the least-squares fit. What all maps have in common, such as the loss of contrast while the
+    splat is still blurred, is left to the splat: only the difference of a map from the mean of all is applied.
+
+    Attributes:
+        training: row numbers of the fitted photographs.
+        maps: of these in their order, [V, 3, 4]: a matrix and an offset.
+    """
+
+    def __init__(self, training: Sequence[int], maps: Float[Tensor, "V 3 4"] | None = None) -> None:
+        self.training = tuple(training)
+        self._rows = {view: row for row, view in enumerate(training)}
+        self.maps = IDENTITY.repeat(len(training), 1, 1) if maps is None else maps
+
+    def moved(self, view: int, fitted: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+        """The map of a photograph, a step nearer to the one that fits; nothing changes."""
+        return self.maps[self._rows[view]].lerp(fitted, STEP)
+
+    def relative(self, view: int, moved: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+        """What is applied to a render of a photograph whose map is `moved`."""
+        current = self.maps[self._rows[view]]
+        return moved - (self.maps.sum(0) + moved - current) / len(self.maps) + IDENTITY
+
+    def set(self, view: int, moved: Float[Tensor, "3 4"]) -> None:
+        self.maps[self._rows[view]] = moved
+
+    def brightness(self) -> Float[Tensor, " V"]:
+        """How bright each photograph is, relative to their mean: what its map makes of a middle grey."""
+        return self._channels().mean(-1)
+
+    def differ(self) -> bool:
+        """Whether photographs differ in exposure or white balance."""
+        return float((self._channels() - 1).abs().max()) > SAME
+
+    def _channels(self) -> Float[Tensor, "V 3"]:
+        relative = self.maps - self.maps.mean(0) + IDENTITY
+        return (0.5 * relative[..., :3].sum(-1) + relative[..., 3]) / 0.5
+
+
+MIN_REACH = 1e-30
+"""Smallest reach in world units: a reach of 0 would divide a learning rate of 0 by 0."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anchor:
+    """Initial means of Gaussians, and how far each may move from there.
+
+    A step of Adam moves a coordinate by its rate at most, or little more. Pulling back by rate / reach of the way after
+    each step therefore leaves it within about one reach, whatever its gradients say; gradients that disagree from one
+    photograph to the next move it less. It is AdamW's decay (Loshchilov & Hutter 2019), towards the seed instead of 0.
+
+    Attributes:
+        means: initial centers, world units.
+        reach: distance in world units, above 0.
+    """
+
+    means: Float32[Tensor, "N 3"]
+    reach: Float32[Tensor, " N"]
+
+    def pull(self, means: Float32[Tensor, "N 3"], rows: Int64[Tensor, " n"], rate: float) -> None:
+        """Moves rows of `means` back, in place, after a step at a learning rate in world units."""
+        share = (rate / self.reach[rows]).clamp(max=1).unsqueeze(1)
+        means[rows] = means[rows].lerp(self.means[rows], share)
+
+    def keep(self, rows: Int64[Tensor, " n"]) -> "Anchor":
+        """The anchor of some rows."""
+        return Anchor(means=self.means[rows], reach=self.reach[rows])
+
+
+def anchor_at(raw: Parameters, length: float) -> Anchor:
+    """An anchor at the present means, with a reach of `length` times each Gaussian's largest standard deviation."""
+    return Anchor(means=raw["means"].clone(), reach=(length * raw["log_scales"].amax(dim=1).exp()).clamp(min=MIN_REACH))
+
 
 RATES = {
     "means": 3e-4,
@@ -45,6 +278,7 @@ RATES = {
     "shN": 2.5e-3 / 20,
 }
 """Learning rates by parameter; that of the means is times the extent of the scene."""
+USUAL_STEPS = 1500
 FINAL_MEANS_RATE = 0.01
 """Share of the rate of the means that is left at the end."""
 SH_EVERY = 0.2
@@ -61,7 +295,7 @@ EMPTY_WEIGHT = 0.5
 class OptimizeConfig:
     """Settings of the optimization of a splat."""
 
-    steps: int = option(1500, "photographs looked at, one a step", ge=0)
+    steps: int = option(USUAL_STEPS, "photographs looked at, one a step", ge=0)
     sh_degree: int = option(2, "how colors may depend on the direction, 0 to 3", ge=0, le=3)
     shrinks: tuple[int, ...] = option(
         (2, 1), "factors by which photographs are made smaller, one stage after the other", ge=1
@@ -192,15 +426,16 @@ def rows_to_keep(
         pose, _ = camera_of(cameras, view, means.device)
         K = photo.K.to(means.device)
         pixels = float(cameras.Ks[view, 0, 0] / photo.K[0, 0]) ** 2
-        rows = rows_in_view(raw, pose, K, photo.width, photo.height, near=raster.near, eps2d=raster.eps2d)
+        height, width = photo.image.shape[:2]
+        rows = rows_in_view(raw, pose, K, width, height, near=raster.near, eps2d=raster.eps2d)
         if not len(rows):
             continue
         ones = torch.ones(len(rows), 3, device=means.device, requires_grad=True)
         shape = (means[rows], raw["quats"][rows], raw["log_scales"][rows].exp(), opacities[rows])
-        seen = rasterize(*shape, ones, pose, K, photo.width, photo.height, config=raster)
+        seen = rasterize(*shape, ones, pose, K, width, height, config=raster)
         (sums,) = torch.autograd.grad(seen.rgb[..., 0].sum(), ones)
         contributions[rows] = torch.maximum(contributions[rows], pixels * sums[:, 0])
-        max_widths[rows] = torch.maximum(max_widths[rows], seen.radii / max(photo.width, photo.height))
+        max_widths[rows] = torch.maximum(max_widths[rows], seen.radii / max(width, height))
     rejected = {"opacity": opacities < config.opacity, "contribution": contributions < config.contribution}
     if config.screen:
         rejected["screen"] = max_widths > config.screen
@@ -217,32 +452,19 @@ def rows_to_keep(
 
 
 class PhotographGradients(NamedTuple):
-    """Losses and gradients of a splat against one photograph.
+    """Losses and gradients of a splat against one photograph."""
 
-    Attributes:
-        losses: the terms of the loss; none where no Gaussian is in view.
-        rows: of the Gaussians that may be visible.
-        grads: with respect to these rows of each parameter.
-        colors: the updated affine color map of the photograph; None where exposures are not fitted.
-    """
-
-    losses: dict[str, float]
-    rows: Int64[Tensor, " n"]
-    grads: Parameters
-    colors: Float[Tensor, "3 4"] | None
+    losses: dict[str, float]  # the terms of the loss; none where no Gaussian is in view
+    rows: Int64[Tensor, " n"]  # of the Gaussians that may be visible
+    grads: Parameters  # with respect to these rows
+    colors: Float[Tensor, "3 4"] | None  # the updated color map of the photograph; None where exposures are not fitted
 
 
 class Pictures(NamedTuple):
-    """A render of one view in two exposures.
+    """A render of one view in two exposures."""
 
-    Attributes:
-        expected: with the exposure that the view is expected to have.
-        matched: with the exposure that fits the photograph best, so that a difference in exposure does not count
-            against the splat.
-    """
-
-    expected: Float[Tensor, "H W 3"]
-    matched: Float[Tensor, "H W 3"]
+    expected: Float[Tensor, "H W 3"]  # the one that the view is expected to have
+    matched: Float[Tensor, "H W 3"]  # the one that fits the photograph best, which does not count against the splat
 
 
 class Optimizer:
@@ -280,7 +502,15 @@ class Optimizer:
         self.exposures = Exposures(self.training, exposures) if fits_exposure else None
         self.device = adam.parameters["means"].device
         centers = photographs.cameras.centers
-        self._check_sizes()
+        smallest = SSIM_WINDOW * max(config.shrinks)
+        for view in self.training:
+            width, height = photographs.cameras.widths[view], photographs.cameras.heights[view]
+            if min(width, height) < smallest:
+                raise InputError(
+                    f"reconstruct: photograph {photographs.names[view]!r} has {width}×{height} pixels, and {smallest} "
+                    f"are needed at least: {SSIM_WINDOW} for SSIM, optimize.shrinks={list(config.shrinks)} times; make "
+                    "image_scale larger or shrinks smaller"
+                )
         poses = {view: camera_of(photographs.cameras, view, self.device)[0] for view in self.training}
         if not any(len(self._rows(pose, photographs.at_scale(view, 2))) for view, pose in poses.items()):
             raise InputError(
@@ -339,7 +569,9 @@ class Optimizer:
         if not len(rows):
             return PhotographGradients({}, rows, {}, None)
         if self.exposures is not None:
-            colors = self.exposures.moved(view, self._fitted_colors(raster, photo))
+            compared = compared_pixels(raster.alpha, photo.mask)
+            fitted = fitted_colors(raster.rgb, photo.image.to(raster.rgb.device), compared)
+            colors = self.exposures.moved(view, fitted)
             raster = raster._replace(rgb=apply_colors(raster.rgb, self.exposures.relative(view, colors)))
         losses = losses_of(raster, photo, empty_weight=EMPTY_WEIGHT)
         total = torch.stack([*losses.values()]).sum()
@@ -351,33 +583,19 @@ class Optimizer:
     def _render(
         self, view: int, photo: ScaledPhotograph, degree: int
     ) -> tuple[Raster, Int64[Tensor, " n"], Parameters]:
-        """A render of a view over black, the rows that may be visible in it, and these rows of the parameters, which
-        receive gradients."""
+        """A render of a view over black, the rows that may be visible, and their parameters, with gradients."""
         pose, center = camera_of(self.photographs.cameras, view, self.device)
-        K, size = photo.K.to(self.device), (photo.width, photo.height)
+        K, (height, width) = photo.K.to(self.device), photo.image.shape[:2]
         rows = self._rows(pose, photo)
         leaves = {name: value[rows].requires_grad_() for name, value in self.parameters.items()}
         shape = (leaves["means"], leaves["quats"], leaves["log_scales"].exp(), leaves["logit_opacities"].sigmoid())
-        raster = rasterize(*shape, seen_colors(leaves, degree, center), pose, K, *size, config=self.raster)
+        raster = rasterize(*shape, seen_colors(leaves, degree, center), pose, K, width, height, config=self.raster)
         return raster, rows, leaves
 
     def _rows(self, pose: Float[Tensor, "4 4"], photo: ScaledPhotograph) -> Int64[Tensor, " n"]:
         """Rows of the Gaussians that may be visible in a view."""
-        K, raster = photo.K.to(self.device), self.raster
-        return rows_in_view(self.parameters, pose, K, photo.width, photo.height, near=raster.near, eps2d=raster.eps2d)
-
-    def _check_sizes(self) -> None:
-        smallest = SSIM_WINDOW * max(self.config.shrinks)
-        for view in self.training:
-            width, height = (
-                int(sides[view]) for sides in (self.photographs.cameras.widths, self.photographs.cameras.heights)
-            )
-            if min(width, height) < smallest:
-                raise InputError(
-                    f"reconstruct: photograph {self.photographs.names[view]!r} has {width}×{height} pixels, "
-                    f"and {smallest} are needed at least: {SSIM_WINDOW} for SSIM, optimize.shrinks="
-                    f"{list(self.config.shrinks)} times; make image_scale larger or shrinks smaller"
-                )
+        K, raster, (height, width) = photo.K.to(self.device), self.raster, photo.image.shape[:2]
+        return rows_in_view(self.parameters, pose, K, width, height, near=raster.near, eps2d=raster.eps2d)
 
     def contributing(self) -> Int64[Tensor, " n"]:
         """Rows that pruning would leave now."""
@@ -406,33 +624,14 @@ class Optimizer:
         pose, _ = camera_of(self.photographs.cameras, view, self.device)
         return len(self._rows(pose, self.photographs.at_scale(view)))
 
-    @staticmethod
-    @torch.no_grad()
-    def _fitted_colors(raster: Raster, photo: ScaledPhotograph) -> Float[Tensor, "3 4"]:
-        image = photo.image.to(raster.rgb.device)
-        return fitted_colors(raster.rgb, image, compared_pixels(raster.alpha, photo.mask))
-
-    def state(self, seconds: float, facts: Mapping[str, Any]) -> State:
-        """The state between two steps."""
-        return State(
-            adam=self.adam,
-            anchor=self.anchor,
-            exposures=None if self.exposures is None or not self.step else self.exposures.maps,
-            step=self.step,
-            seconds=seconds,
-            facts=facts,
-        )
-
-    def gaussians(self) -> Gaussians:
-        """The current splat."""
-        return gaussians_of(self.parameters)
-
     @torch.no_grad()
     def pictures(self, view: int, photo: ScaledPhotograph, colors: Float[Tensor, "3 4"]) -> Pictures:
         """Renders of a view of the current splat, in [0, 1]; `colors` is the map of the exposure that is expected."""
         raster = self._render(view, photo, self.config.sh_degree)[0]
-        fitted = self._fitted_colors(raster, photo)
-        return Pictures(*(apply_colors(raster.rgb, color_map).clamp(0, 1).cpu() for color_map in (colors, fitted)))
+        compared = compared_pixels(raster.alpha, photo.mask)
+        fitted = fitted_colors(raster.rgb, photo.image.to(raster.rgb.device), compared)
+        expected, matched = apply_colors(raster.rgb, colors), apply_colors(raster.rgb, fitted)
+        return Pictures(expected.clamp(0, 1).cpu(), matched.clamp(0, 1).cpu())
 
     @torch.no_grad()
     def opacity(self, view: int, photo: ScaledPhotograph) -> Float[Tensor, "H W"]:

@@ -22,8 +22,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track
 from gsencoder.core.settings import check_limits, option
 from gsencoder.data.splats.ply import inria_row_bytes
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
-from gsencoder.reconstruct.parameters import RowAdam
+from gsencoder.reconstruct.optimize import USUAL_STEPS, OptimizeConfig, Optimizer, RowAdam
 from gsencoder.reconstruct.score import MAX_COMPARISONS, score
 from gsencoder.types import Cameras
 
@@ -123,7 +122,7 @@ def affordable_steps(optimizer: Optimizer, minutes: float) -> int:
     """The number of steps that the formula allows; those of the settings where they are not the default, or for 0
     minutes."""
     config = optimizer.config
-    if not minutes or config.steps != OptimizeConfig().steps:
+    if not minutes or config.steps != USUAL_STEPS:
         return config.steps
     views = spread_views(optimizer.training, SEEN_VIEWS)
     gaussians = float(np.mean([optimizer.rows_seen(view) for view in views]))
@@ -214,24 +213,25 @@ def make_plan(
     validations: Callable[[int], int],
     *,
     double_means: bool,
-    spent: Callable[[], float],
+    began: float,
+    now: Callable[[], float],
 ) -> Plan:
     """Plans a reconstruction that has not begun, and sets its colors; `apply_plan` carries the rest out.
 
     Args:
         validations: how many there are in a number of steps.
         double_means: whether the splat's positions are written as doubles.
-        spent: seconds until now.
+        began: when the command began, as `now` counts.
     """
     plan = Plan(steps=optimizer.config.steps, sh_degree=optimizer.config.sh_degree)
     if budget.megabytes is not None:
         plan = _within_megabytes(optimizer, budget, plan, double_means)
     if budget.seconds is None:
-        return replace(plan, steps=affordable_steps(optimizer, budget.minutes), spent=spent())
-    refuse_late(budget, spent(), "reading photographs and seeding")
+        return replace(plan, steps=affordable_steps(optimizer, budget.minutes), spent=now() - began)
+    refuse_late(budget, now() - began, "reading photographs and seeding")
     # Trial steps have the colors of the plan.
     apply_plan(optimizer, plan)
-    costs, before, steps = measured_costs(optimizer, held_out), spent(), plan.steps
+    costs, before, steps = measured_costs(optimizer, held_out), now() - began, plan.steps
     config, prune = optimizer.config, optimizer.pruning
     each = sum(costs.steps[config.shrink_at(step)] for step in range(steps)) / steps
     prunings = costs.pruning * sum(prune.due(step, config) for step in range(1, steps + 1))
@@ -263,6 +263,19 @@ def apply_plan(optimizer: Optimizer, plan: Plan) -> None:
         # There are no moments yet.
         shN = optimizer.parameters["shN"][:, :coefficients].contiguous()
         optimizer.adam = RowAdam({**optimizer.parameters, "shN": shN})
+
+
+def describe_plan(optimizer: Optimizer, steps: int, option: str) -> str:
+    """What is about to happen; `option` chose the number of steps where it is not that of the settings."""
+    widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
+    usual = optimizer.config.steps
+    number = f"{steps - optimizer.step:,} more of {steps:,} steps" if optimizer.step else f"{steps:,} steps"
+    if steps != usual:
+        number += f" instead of {usual:,} ({option})"
+    return (
+        f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "
+        f"{len(optimizer.parameters['means']):,} Gaussians, {number}"
+    )
 
 
 def _within_megabytes(optimizer: Optimizer, budget: ReconstructBudget, plan: Plan, double_means: bool) -> Plan:
@@ -299,4 +312,4 @@ def refusing_late(track: Track, budget: ReconstructBudget, elapsed: Callable[[],
             refuse_late(budget, elapsed(), "reading photographs and seeding")
             yield item
 
-    return track if budget.seconds is None else in_time
+    return in_time

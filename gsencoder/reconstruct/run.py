@@ -1,10 +1,11 @@
 """Reconstruction: posed photographs to Gaussians by seeding, optimization and pruning (SplatDistill, section 3.1)."""
 
+import math
 import os
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,15 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
+from torch import Tensor
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.budget import reject_options_set_by_budget
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, SceneWarning, error_hint
 from gsencoder.core.files import plain
-from gsencoder.core.logs import LOG_FILE, Log, read_log
 from gsencoder.core.process import Clock, Device, Track, defer_signals, untracked
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import check_limits, first_difference, option
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.from_photographs import (
     MAX_DENSE_SPACING,
@@ -31,41 +33,40 @@ from gsencoder.data.seeding.from_photographs import (
 )
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
 from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
-from gsencoder.reconstruct.parameters import (
-    CHECKPOINT_FILE,
-    PLAN,
+from gsencoder.reconstruct.optimize import (
+    Anchor,
+    OptimizeConfig,
+    Optimizer,
     RowAdam,
-    State,
     anchor_at,
-    load_state,
+    gaussians_of,
     parameters_from,
-    save_state,
 )
-from gsencoder.reconstruct.plan import Plan, ReconstructBudget, apply_plan, make_plan, refusing_late
+from gsencoder.reconstruct.plan import Plan, ReconstructBudget, apply_plan, describe_plan, make_plan, refusing_late
 from gsencoder.reconstruct.score import (
     Comparison,
     LogRow,
+    Report,
+    Validation,
     compare,
-    covisible_pixels,
-    describe,
     describe_exposure,
-    describe_plan,
     predict_exposures,
-    score,
     split,
 )
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Gaussians, Scene
 
-START_AGAIN = "give resume=false to start again"
-Report = Callable[[str], None]
-"""Receives one line of text for people."""
+CHECKPOINT_FILE = "reconstruction.safetensors"
+IMAGE_SCALE = "image_scale"
+"""The setting that says by which factor a budget made the photographs smaller."""
+PLAN = "plan"
+"""The fact that holds the plan."""
+ANCHOR_SHAPES: dict[str, tuple[int | str, ...]] = {"means": ("N", 3), "reach": ("N",)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructConfig:
-    """How photographs become Gaussians, and how the result is judged."""
+    """How photographs become Gaussians, and how the result is scored."""
 
     holdout: int = option(8, "hold out every n-th photograph for validation; 0 = none", ge=0)
     validate_every: int = option(500, "steps between validations; 0 = at the end alone", ge=0)
@@ -96,6 +97,95 @@ class ReconstructConfig:
         """The settings that an interrupted run must share with the run that continues it, as JSON values."""
         names = ("seeds", "dense", "optimize", "budget", "raster", "holdout")
         return {name: plain(getattr(self, name)) for name in names}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class State:
+    """A reconstruction between two steps. The first is of step 0: seeds are sought once.
+
+    Attributes:
+        adam: parameters and moments.
+        anchor: what holds positions near their seeds, if anything does.
+        exposures: an affine map of colors for each fitted photograph, if they are fitted; None at step 0, and
+            where photographs do not differ in exposure.
+        facts: how it began, as JSON values: number and source of the seeds, what was added to points, and the plan.
+    """
+
+    adam: RowAdam
+    anchor: Anchor | None
+    exposures: Float[Tensor, "V 3 4"] | None = None
+    step: int
+    seconds: float
+    facts: Mapping[str, Any]
+
+
+def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
+    """Writes the state; `settings` are what a run must have in common to go on from here, as JSON values."""
+    arrays = {
+        f"{kind}.{name}": value.detach().cpu().numpy()
+        for kind in RowAdam.KINDS
+        for name, value in getattr(state.adam, kind).items()
+    }
+    if state.anchor is not None:
+        arrays |= {f"anchor.{name}": getattr(state.anchor, name).cpu().numpy() for name in ANCHOR_SHAPES}
+    if state.exposures is not None:
+        arrays["exposure.maps"] = state.exposures.numpy()
+    header = {
+        "step": state.step,
+        "adam_steps": state.adam.steps,
+        "seconds": state.seconds,
+        "facts": dict(state.facts),
+        "settings": dict(settings),
+    }
+    write_archive(path, arrays, header)
+
+
+def image_scale_of(path: Path) -> float | None:
+    """The factor by which an unfinished run makes photographs smaller; None where there is no such run, or its
+    checkpoint does not say so or is damaged, which `load_state` says."""
+    if not os.path.lexists(path):
+        return None
+    with suppress(InputError), open_archive(path) as file:
+        scale = file.value("settings", dict).get(IMAGE_SCALE)
+        return scale if isinstance(scale, float) and 0 < scale <= 1 else None
+    return None
+
+
+def load_state(path: Path, settings: Mapping[str, Any], *, sh_degree: int, device: torch.device | str = "cpu") -> State:
+    """The state that a run has left; the colors are of `sh_degree`, or of the degree of the plan in its facts.
+
+    Raises:
+        InputError: damaged, or of a run with other settings; the first that differs is named.
+    """
+    with error_hint(f"give resume=false to start again, or remove {path}"), open_archive(path) as file:
+        earlier = file.value("settings", dict)
+        if earlier != settings:
+            raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
+        step, adam_steps = file.value("step", int), file.value("adam_steps", int)
+        seconds, facts = float(file.value("seconds", float, int)), file.value("facts", dict)
+        if not (0 <= adam_steps <= step and 0 <= seconds < math.inf):
+            raise InputError(f"a state that no run was in (step {step})")
+        degree = facts.get(PLAN, {}).get("sh_degree", sh_degree)
+        if degree not in range(sh_degree + 1):
+            raise InputError(f"colors of a degree that no run has ({degree!r})")
+        shapes: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+        shapes |= {"sh0": (1, 3), "shN": ((degree + 1) ** 2 - 1, 3)}
+        tables = {
+            kind: {
+                name: torch.from_numpy(file.array(f"{kind}.{name}", "float32", ("N", *shape)).copy()).to(device)
+                for name, shape in shapes.items()
+            }
+            for kind in RowAdam.KINDS
+        }
+        anchor = None
+        if "anchor.means" in file:
+            arrays = {name: file.array(f"anchor.{name}", "float32", shape) for name, shape in ANCHOR_SHAPES.items()}
+            anchor = Anchor(**{name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()})
+        exposures = None
+        if "exposure.maps" in file:
+            exposures = torch.from_numpy(file.array("exposure.maps", "float32", ("V", 3, 4)).copy())
+    adam = RowAdam.restored(tables, adam_steps)
+    return State(adam=adam, anchor=anchor, exposures=exposures, step=step, seconds=seconds, facts=facts)
 
 
 class Start(NamedTuple):
@@ -144,7 +234,7 @@ def initial_gaussians(
         added = densify(photographs, training, scene.sfm_points, colors, dense, track=track)
         seen = replace(seen, sfm_colors=colors)
     if added is None:
-        return Start(seed(seen, replace(seeds, source=source), track=track), source)
+        return Start(seed(seen, seeds, track=track), source)
     gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=MAX_DENSE_SPACING)
     return Start(gaussians, source, added, triangulated)
 
@@ -182,41 +272,6 @@ def initial_state(
     if start.source in ("depth", "mesh", "tsdf") and config.optimize.anchor_sigmas:
         anchor = anchor_at(adam.parameters, config.optimize.anchor_sigmas)
     return State(adam=adam, anchor=anchor, step=0, seconds=0.0, facts=seeding)
-
-
-class Validation:
-    """Scores of held-out photographs: rows of the log, and lines for people.
-
-    Attributes:
-        rows: oldest first, those of the runs that this one continues among them.
-    """
-
-    def __init__(self, optimizer: Optimizer, held_out: Sequence[int], work: Path, report: Report) -> None:
-        with error_hint(START_AGAIN):
-            self._log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
-            try:
-                rows = read_log(work / LOG_FILE)
-                self.rows: list[LogRow] = [{name: float(cell) for name, cell in row.items()} for row in rows]
-            except ValueError as error:
-                raise InputError(f"{work / LOG_FILE}: damaged: {error}") from error
-        self._optimizer, self._held_out, self._report = optimizer, held_out, report
-        self._seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
-
-    def __call__(self, seconds: float) -> None:
-        """Validates the splat as it is; `seconds` have gone since the first step."""
-        one = self._optimizer
-        # A continued run may begin at a step whose validation was cut off, or whose row is in the log already.
-        if not self._held_out or (self.rows and self.rows[-1]["step"] == one.step):
-            return
-        scores = score(one, self._held_out, self._seen)._asdict().items()
-        row: LogRow = {"seconds": seconds, "gaussians": len(one.parameters["means"])}
-        row |= {name: value for name, value in scores if value is not None}
-        self._log.add(one.step, row)
-        self.rows.append({"step": one.step, **row})
-        self._report(
-            f"step {one.step} of {one.config.steps}: {describe(row)}, {row['gaussians']:,} Gaussians, "
-            f"{row['seconds']:.0f} s"
-        )
 
 
 @contextmanager
@@ -312,12 +367,15 @@ def reconstruct(
     """
     if scene.views is None:
         raise InputError(f"reconstruct: scene {scene.name} has no photographs to fit a splat to")
-    clock, budget, began, target = Clock(), config.budget, now() - spent, choose_device(device)
+    budget, began, target = config.budget, now() - spent, choose_device(device)
     with ExitStack() as stack:
         folder = work or Path(stack.enter_context(TemporaryDirectory()))
         checkpoint = folder / CHECKPOINT_FILE
         continued = os.path.lexists(checkpoint)
-        in_time = track if continued else refusing_late(track, budget, lambda: now() - began)
+        in_time = track
+        if budget.seconds is not None and not continued:
+            in_time = refusing_late(track, budget, lambda: now() - began)
+        clock = Clock()
         with clock("read"):
             photographs = Photographs(scene.views, track=in_time)
         training, held_out = split(photographs, config.holdout)
@@ -349,16 +407,27 @@ def reconstruct(
                     budget,
                     lambda steps: sum(config.validates_at(step, steps) for step in range(steps + 1)),
                     double_means=bool(scene.origin.any()),
-                    spent=lambda: now() - began,
+                    began=began,
+                    now=now,
                 )
+            option = "budget.minutes" if budget.seconds is None else "budget.seconds"
+            description = describe_plan(optimizer, plan.steps, option)
             apply_plan(optimizer, plan)
-        option = "budget.minutes" if budget.seconds is None else "budget.seconds"
-        for line in (describe_plan(optimizer, config.optimize.steps, option), *plan.notes):
+        for line in (description, *plan.notes):
             report(line)
         start, facts = now() - state.seconds, {**state.facts, PLAN: asdict(plan)}
 
         def save() -> None:
-            save_state(checkpoint, optimizer.state(now() - start, facts), identity)
+            color_maps = None if optimizer.exposures is None or not optimizer.step else optimizer.exposures.maps
+            state = State(
+                adam=optimizer.adam,
+                anchor=optimizer.anchor,
+                exposures=color_maps,
+                step=optimizer.step,
+                seconds=now() - start,
+                facts=facts,
+            )
+            save_state(checkpoint, state, identity)
 
         if not continued:
             save()
@@ -377,6 +446,7 @@ def reconstruct(
                 with defer_signals():
                     optimizer.prune()
             validate(now() - start)
+        gaussians = gaussians_of(optimizer.parameters)
         exposure = differing = source = None
         predicted = predict_exposures(optimizer.exposures, photographs.cameras, held_out)
         if optimizer.exposures is not None:
@@ -386,7 +456,7 @@ def reconstruct(
             report(differing)
         comparisons = compare(optimizer, held_out, matched=differing is not None and source == "mean")
         return Reconstruction(
-            gaussians=optimizer.gaussians(),
+            gaussians=gaussians,
             seeding={name: value for name, value in state.facts.items() if name != PLAN},
             steps=optimizer.step,
             training=optimizer.training,

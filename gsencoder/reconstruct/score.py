@@ -2,8 +2,9 @@
 exposures that the fitted ones let expect."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +13,12 @@ from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from torch import Tensor
 
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.errors import InputError, SceneWarning, error_hint, listed
+from gsencoder.core.logs import LOG_FILE, Log, read_log
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.stereo import confirms, sample_depth, world_points
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.parameters import IDENTITY, SAME, Exposures
-from gsencoder.render.images import inner, psnr, ssim
+from gsencoder.reconstruct.optimize import SAME, Exposures, Optimizer
+from gsencoder.render.images import IDENTITY, inner, psnr, ssim
 from gsencoder.types import Cameras
 from gsencoder.types.orientation import turned
 
@@ -158,7 +159,7 @@ def split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
     Warns:
         SceneWarning: some are masked all over; they are named.
     """
-    count = len(photographs)
+    count = len(photographs.names)
     held_out = [view for view in range(count) if every and view % every == 0]
     training = [view for view in range(count) if view not in held_out]
     if len(training) < MIN_PHOTOGRAPHS:
@@ -166,8 +167,7 @@ def split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
             f"reconstruct: expected at least {MIN_PHOTOGRAPHS} photographs to fit, got {len(training)} of {count}; "
             "give more photographs" + (f", or hold out fewer than every {every}th (holdout=)" if every else "")
         )
-    masks = {view: photographs.mask(view) for view in range(count)}
-    masked = {view for view, mask in masks.items() if mask is not None and not inner(mask).any()}
+    masked = {view for view, mask in enumerate(photographs.masks) if mask is not None and not inner(mask).any()}
     for views, subject, least in (
         (training, "photographs to fit", MIN_PHOTOGRAPHS),
         (held_out, "held-out photographs", 0),
@@ -275,19 +275,6 @@ class Comparison:
     render: UInt8[np.ndarray, "H W 3"]
 
 
-def describe_plan(optimizer: Optimizer, usual: int, option: str) -> str:
-    """What is about to happen; `option` changed the number of steps where it is not the usual one."""
-    widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
-    steps = optimizer.config.steps
-    number = f"{steps - optimizer.step:,} more of {steps:,} steps" if optimizer.step else f"{steps:,} steps"
-    if steps != usual:
-        number += f" instead of {usual:,} ({option})"
-    return (
-        f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "
-        f"{len(optimizer.parameters['means']):,} Gaussians, {number}"
-    )
-
-
 def describe_exposure(darkest: float, brightest: float, source: str) -> str | None:
     """How the photographs differ in brightness, relative to their mean, and what predicts that of others; None where
     they hardly differ."""
@@ -333,3 +320,42 @@ def describe(row: LogRow) -> str:
     return (
         f"{row['seen_psnr']:.2f} dB where a fitted photograph shows the surface ({row['seen']:.0%}), {overall} in all"
     )
+
+
+START_AGAIN = "give resume=false to start again"
+Report = Callable[[str], None]
+"""Receives one line of text for people."""
+
+
+class Validation:
+    """Scores of held-out photographs: rows of the log, and lines for people.
+
+    Attributes:
+        rows: oldest first, those of the runs that this one continues among them.
+    """
+
+    def __init__(self, optimizer: Optimizer, held_out: Sequence[int], work: Path, report: Report) -> None:
+        with error_hint(START_AGAIN):
+            self._log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
+            try:
+                rows = read_log(work / LOG_FILE)
+                self.rows: list[LogRow] = [{name: float(cell) for name, cell in row.items()} for row in rows]
+            except ValueError as error:
+                raise InputError(f"{work / LOG_FILE}: damaged: {error}") from error
+        self._optimizer, self._held_out, self._report = optimizer, held_out, report
+        self._seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
+
+    def __call__(self, seconds: float) -> None:
+        """Validates the splat as it is; `seconds` have gone since the first step."""
+        one = self._optimizer
+        # A continued run may begin at a step whose validation was cut off, or whose row is in the log already.
+        if not self._held_out or (self.rows and self.rows[-1]["step"] == one.step):
+            return
+        scores = score(one, self._held_out, self._seen)._asdict().items()
+        row: LogRow = {"seconds": seconds, "gaussians": len(one.parameters["means"])}
+        row |= {name: value for name, value in scores if value is not None}
+        size = f"{row['gaussians']:,} Gaussians"
+        line = f"step {one.step} of {one.config.steps}: {describe(row)}, {size}, {row['seconds']:.0f} s"
+        self._log.add(one.step, row)
+        self.rows.append({"step": one.step, **row})
+        self._report(line)

@@ -15,12 +15,11 @@ from gsencoder.core.files import atomic_file, read_foreign_text, sha256_of
 from gsencoder.core.process import Clock, Track, untracked
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.data.readers.images import check_picture
-from gsencoder.data.readers.posed import inside
-from gsencoder.data.readers.undistort import load_pycolmap
+from gsencoder.data.readers.posed import inside, load_pycolmap
 from gsencoder.data.scenes import SceneConfig, distinct_paths, find_scenes, is_scene, listed_paths, load_scene
 from gsencoder.data.video import SUFFIXES as VIDEO_SUFFIXES
 from gsencoder.data.video import VideoConfig, is_video, take_frames
-from gsencoder.reconstruct.parameters import CHECKPOINT_FILE
+from gsencoder.reconstruct.run import CHECKPOINT_FILE
 from gsencoder.types import Scene
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")

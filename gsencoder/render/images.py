@@ -1,5 +1,5 @@
-"""Rendered images of a splat: colors from SH, composited by a Blend, their PSNR and SSIM, and how much of a view some
-Gaussians fill, roughly."""
+"""Rendered images of a splat: colors from SH, composited by a Blend, their PSNR and SSIM, the map of their colors to
+those of a photograph, and how much of a view some Gaussians fill, roughly."""
 
 import math
 from collections.abc import Sequence
@@ -111,6 +111,40 @@ def inner(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "h w"]:
     """The pixels that are the middle of a window inside the picture."""
     edge = WINDOW // 2
     return mask[edge:-edge, edge:-edge]
+
+
+IDENTITY = torch.eye(3, 4)  # The affine map of colors that changes none
+RIDGE = 1e-3
+"""Pull toward the identity, as a variance of colors in [0, 1]: what a picture does not vary in is not fitted."""
+COVERED = 0.5
+"""Pixels of a render below this alpha show the background, and tell nothing."""
+
+
+@torch.no_grad()
+def fitted_colors(
+    render: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W"]
+) -> Float[Tensor, "3 4"]:
+    """The affine map A·c + b of the render's colors that is nearest to the photograph's in a mask, by ridge regression:
+    A in the first three columns and b in the last, on the CPU; the identity where the mask is empty."""
+    weights = mask.unsqueeze(-1).to(render.dtype)
+    inputs = torch.cat((render, torch.ones_like(render[..., :1])), dim=-1) * weights
+    rows, residuals = inputs.flatten(0, 1), ((image - render) * weights).flatten(0, 1)
+    count = float(mask.sum().clamp(min=1))
+    gram, moments = ((rows.T @ other).double().cpu() / count for other in (rows, residuals))
+    change = torch.linalg.solve(gram + RIDGE * torch.eye(4, dtype=torch.float64), moments)
+    return IDENTITY + change.T.float()
+
+
+def apply_colors(colors: Float[Tensor, "H W 3"], affine: Float[Tensor, "3 4"]) -> Float[Tensor, "H W 3"]:
+    """A·c + b for each pixel."""
+    affine = affine.to(colors)
+    return colors @ affine[:, :3].T + affine[:, 3]
+
+
+def compared_pixels(alpha: Float[Tensor, "H W"], mask: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"]:
+    """Pixels whose colors are compared: what the splat covers and the mask leaves."""
+    covered = alpha > COVERED
+    return covered if mask is None else covered & mask.to(covered.device)
 
 
 OPAQUE = 0.3

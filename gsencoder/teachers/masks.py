@@ -24,7 +24,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import ANY, digest_files, find_file, load_companion, load_pretrained, read_config
 from gsencoder.core.process import Device
 from gsencoder.core.settings import option
-from gsencoder.data.readers.label_images import LABEL_SUFFIXES, label_files
+from gsencoder.data.readers.masks import LABEL_SUFFIXES, label_files
 from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.pictures import photograph, read_preprocessing
 from gsencoder.types import Scene, Views

@@ -25,7 +25,7 @@ from gsencoder.models.plan import CloudPlan, join_plans
 from gsencoder.train.losses import TERMS, Batch, LossConfig, RenderRows, TeacherRecipe, TeacherTargets
 from gsencoder.train.prepared import ClassBalance, PreparedScene, ViewRows, nearest_codes
 from gsencoder.types import SH_C0, Cameras, Gaussians
-from gsencoder.types.checks import perpendicular
+from gsencoder.types.scene import perpendicular
 
 NEAR = 0.01
 """Smallest depth of a Gaussian that a view shows, world units."""

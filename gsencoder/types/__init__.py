@@ -6,7 +6,7 @@ pixel centers lie at .5; quaternions are wxyz; depth is z. Values are physical: 
 opacities are probabilities, never logarithms or logits.
 """
 
-from gsencoder.types.checks import UNIT_TOLERANCE, check_unit
+from gsencoder.core.arrays import UNIT_TOLERANCE
 from gsencoder.types.features import (
     Box,
     FeatureBasis,
@@ -26,6 +26,7 @@ from gsencoder.types.scene import (
     SceneObject,
     Teacher,
     Views,
+    check_unit,
     sh_from_colors,
 )
 

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Integer
 
-from gsencoder.types.checks import check_array, check_finite, check_rows, fail
+from gsencoder.core.arrays import check_array, check_finite, check_rows, fail
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,7 +220,7 @@ class Localization:
         queries: the words, in the order asked.
         relevancy: in [−1, 1] or [0, 1]; NaN where the Gaussian was never seen.
         thresholds: the relevancy above which a Gaussian was taken.
-        probabilities: that a word is in the scene: the highest of its boxes, with those that were left out as too
+        probabilities: that a word is in the scene: the highest of its boxes, with the ones left out as too
             improbable; 0 where no Gaussians answer it.
         boxes: best first within each query, queries in order.
     """

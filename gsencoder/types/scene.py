@@ -1,11 +1,15 @@
 """Scenes: Gaussians, cameras, posed views and labeled objects of one place.
 
+A transform [R | t] takes points of one frame to another, x ↦ R x + t, and its name says which: `target_from_source`.
+Camera axes are OpenCV's: x right, y down, z forward.
+
 Cameras: pinhole intrinsics and rigid poses, projection and its inverse (Hartley and Zisserman 2004, ch. 6), for numpy
-arrays of any float type; gsencoder.geometry holds the pinhole for tensors. Pixel centers lie at .5, as in COLMAP. Depth
+arrays of any float type; gsencoder.geometry holds both for tensors. Pixel centers lie at .5, as in COLMAP. Depth
 is z in the camera, and not the length of the ray.
 """
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,18 +18,78 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 
-from gsencoder.types.checks import (
-    UNIT_TOLERANCE,
-    check_array,
-    check_finite,
-    check_rows,
-    check_unit,
-    fail,
-    invert_rigid,
-    move_origin,
-    transform,
-)
+from gsencoder.core.arrays import UNIT_TOLERANCE, check_array, check_finite, check_rows, fail
+from gsencoder.core.errors import InputError
 from gsencoder.types.features import FeatureMap, FeatureSpace, GaussianFeatures
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL's camera axes are x right, y up, z backward. The matrix is its own inverse."""
+
+
+def transform(
+    target_from_source: Float[np.ndarray, "*v 4 4"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "*v n 3"]:
+    """R x + t for each transform and point, in the float type of both.
+
+    The result is laid out coordinate by coordinate: long rows of x, y and z are several times faster to compute with.
+    """
+    moved = target_from_source[..., :3, :3] @ points.T
+    moved += target_from_source[..., :3, 3:]
+    return moved.mT
+
+
+def invert_rigid(target_from_source: Float[np.ndarray, "*v 4 4"]) -> Float[np.ndarray, "*v 4 4"]:
+    """source_from_target of rigid transforms: [Rᵀ | −Rᵀt]."""
+    rotation = target_from_source[..., :3, :3].mT
+    inverse = np.zeros_like(target_from_source)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3:] = -(rotation @ target_from_source[..., :3, 3:])
+    inverse[..., 3, 3] = 1
+    return inverse
+
+
+def move_origin(
+    cam_from_world: Float64[np.ndarray, "*v 4 4"], origin: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "*v 4 4"]:
+    """The same camera in a world whose coordinates count from `origin`: t becomes t + R·origin.
+
+    In float64, so that for a distant origin the large numbers cancel before anything is rounded to float32.
+    """
+    moved = cam_from_world.copy()
+    moved[..., :3, 3] += cam_from_world[..., :3, :3] @ origin
+    return moved
+
+
+def perpendicular(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+    """A unit vector perpendicular to `direction`, which is of any length but zero.
+
+    It is the cross product with the coordinate axis that is farthest from parallel: the result of the z axis is y.
+    """
+    normal = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    return normal / np.linalg.norm(normal)
+
+
+def look_rotation(forward: Float64[np.ndarray, "V 3"], up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "V 3 3"]:
+    """Rotations cam_from_world of cameras that look along `forward`, level with `up`; rows are right, down, forward.
+
+    Args:
+        forward: unit vectors in the world.
+        up: of the world, of any length; not parallel to any of them.
+    """
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def look_at(
+    centers: Float64[np.ndarray, "V 3"], forward: Float64[np.ndarray, "V 3"], up: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "V 4 4"]:
+    """cam_from_world of cameras at `centers` with the axes of `look_rotation`."""
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    poses[:, :3, :3] = look_rotation(forward, up)
+    poses[:, :3, 3] = -np.einsum("vij,vj->vi", poses[:, :3, :3], centers)
+    return poses
+
 
 SH_C0 = 0.5 / math.sqrt(math.pi)  # A color is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction
 
@@ -315,6 +379,13 @@ class SceneObject:
     placed: bool = True
     views: int | None = 0  # in how many it shows; None where not counted (`with_counted_views` of the same module does)
     max_pixels: int | None = 0  # its largest visible area in a view; None as above
+
+
+def check_unit(metres_per_unit: float, name: str) -> None:
+    """Complains about what is no unit of length."""
+    good = isinstance(metres_per_unit, (int, float)) and not isinstance(metres_per_unit, bool)
+    if not good or not 0 < metres_per_unit <= sys.float_info.max:
+        raise InputError(f"{name}: expected a positive number of metres, got {str(metres_per_unit)[:40]}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -17,7 +17,7 @@ from gsencoder.data.readers.masks import Background, _outline, background_pixels
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic import Solid
 from gsencoder.types import Cameras, Views
-from gsencoder.types.checks import OPENCV_FROM_OPENGL
+from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 Ground = Literal["transparent", "white", "black"]
 DISTANCE, FIELD = 4.0, 0.69

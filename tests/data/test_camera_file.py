@@ -9,7 +9,7 @@ from splats import random_rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.transforms_json import MAX_PIXELS, read_cameras
-from gsencoder.types.checks import OPENCV_FROM_OPENGL
+from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 ORIGIN = np.zeros(3)
 INTRINSICS = {"fx": 500.0, "fy": 510.0, "cx": 320.5, "cy": 239.5, "width": 640, "height": 480}

@@ -9,7 +9,7 @@ from scene_files import photograph, world_from_cams, write_colmap
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap import CAMERA_PARAMS, read_colmap
-from gsencoder.data.readers.undistort import load_pycolmap
+from gsencoder.data.readers.posed import load_pycolmap
 from gsencoder.data.scenes import load_scene
 
 FILES = ["cameras.bin", "images.bin", "points3D.bin"]
@@ -105,7 +105,7 @@ def test_the_parameter_counts_are_those_of_pycolmap():
 def test_pictures_can_be_written_after_pycolmap_came_in():
     """pycolmap's zlib and the system's must not meet (see load_pycolmap): the process would abort."""
     code = (
-        "from gsencoder.data.readers.undistort import load_pycolmap; load_pycolmap(); "
+        "from gsencoder.data.readers.posed import load_pycolmap; load_pycolmap(); "
         "import io, zlib; from PIL import Image; "
         "Image.new('RGB', (64, 48)).save(io.BytesIO(), 'PNG'); print(len(zlib.compress(b'a' * 1000)))"
     )

@@ -9,8 +9,8 @@ from scene_files import photograph, save, with_depth
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers import images
-from gsencoder.data.readers.depth_images import DepthFiles
 from gsencoder.data.readers.images import (
+    DepthFiles,
     ImageFiles,
     PixelGrid,
     picture_info,
@@ -20,9 +20,8 @@ from gsencoder.data.readers.images import (
     read_rgba,
     read_small,
 )
-from gsencoder.data.readers.label_images import LabelFiles
-from gsencoder.data.readers.masks import MaskFiles
-from gsencoder.data.readers.undistort import CameraModel, pinhole_for, remap_between
+from gsencoder.data.readers.masks import LabelFiles, MaskFiles
+from gsencoder.data.readers.posed import CameraModel, pinhole_for, remap_between
 from gsencoder.types.orientation import EXCHANGED, INVERSE, turned
 
 PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))

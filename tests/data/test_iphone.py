@@ -11,11 +11,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.layouts import layout_of
-from gsencoder.data.scenes import find_scenes, load_scene
+from gsencoder.data.scenes import find_scenes, layout_of, load_scene
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
-from gsencoder.types.checks import OPENCV_FROM_OPENGL
+from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 Poses = Literal["colmap", "nerfstudio", "arkit"]
 EVERY = 10

@@ -6,9 +6,8 @@ from rgbd_layouts import WRITERS, write_replica, write_tum
 from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.depth_images import register_depth
-from gsencoder.data.readers.layouts import LAYOUTS, layout_of
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.readers.images import register_depth
+from gsencoder.data.scenes import LAYOUTS, SceneConfig, find_scenes, layout_of, load_scene
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
 

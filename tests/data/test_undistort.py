@@ -5,10 +5,9 @@ from hypothesis import strategies as st
 from scene_files import save, with_depth
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.depth_images import DepthFiles
-from gsencoder.data.readers.images import ImageFiles, PixelGrid
+from gsencoder.data.readers.images import DepthFiles, ImageFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
-from gsencoder.data.readers.undistort import CameraModel, check_camera, pinhole_for, remap_between
+from gsencoder.data.readers.posed import CameraModel, check_camera, pinhole_for, remap_between
 
 MODELS = {
     "SIMPLE_RADIAL": (600, 360, 270, 0.03),
@@ -35,7 +34,7 @@ def model(name: str, width: int = 720, height: int = 540) -> CameraModel:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_every_invertible_model_maps_pinhole_pixels_to_their_rays(name):
-    from gsencoder.data.readers.undistort import load_pycolmap
+    from gsencoder.data.readers.posed import load_pycolmap
 
     camera = model(name)
     pinhole = pinhole_for(camera, "test")

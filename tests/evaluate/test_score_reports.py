@@ -10,7 +10,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable, write_classes
-from gsencoder.data.labels.files import write_whole_numbers
+from gsencoder.data.labels.files import write_integer_lines
 from gsencoder.evaluate.benchmarks import answers, captions, recognition, referring, text_metrics
 from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.instances import prediction_of_masks, score_instances, write_instance_prediction
@@ -53,7 +53,7 @@ def instance_folders(folder: Path, truths: dict[str, np.ndarray], masks: dict[st
         (folder / name).mkdir()
     rows = np.arange(SIZE)
     for scene, ids in truths.items():
-        write_whole_numbers(folder / "truth" / f"{scene}.txt", ids)
+        write_integer_lines(folder / "truth" / f"{scene}.txt", ids)
         made = prediction_of_masks(
             scene,
             [(rows >= first) & (rows < last) for first, last, _, _ in masks[scene]],
@@ -115,7 +115,7 @@ def test_equal_scores_masks_over_several_objects_and_smaller_regions_are_told(tm
         "Of the masks 1 overlap several true objects by more than 0.25; AP at 0.25 depends"
     )
     assert report.line.endswith(" without classes")
-    write_whole_numbers(folders[1] / "a.txt", np.repeat([4001, 0], [99, 901]))
+    write_integer_lines(folders[1] / "a.txt", np.repeat([4001, 0], [99, 901]))
     with pytest.raises(InputError, match="no object of the 3 classes has 100 vertices or more in 1 scene"):
         score_instances(*folders, CLASSES)
 
@@ -128,7 +128,7 @@ def label_folders(folder: Path, labels: dict[str, tuple[list[int], list[int]]]) 
     for name, column in (("truth", 0), ("predictions", 1)):
         (folder / name).mkdir()
         for scene, pair in labels.items():
-            write_whole_numbers(folder / name / f"{scene}.txt", np.array(pair[column]))
+            write_integer_lines(folder / name / f"{scene}.txt", np.array(pair[column]))
     return folder / "predictions", folder / "truth"
 
 

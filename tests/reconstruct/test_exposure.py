@@ -7,16 +7,8 @@ import pytest
 import torch
 from walls import cameras, wall_optimizer, wall_views
 
-from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
-from gsencoder.reconstruct.parameters import (
-    IDENTITY,
-    ROUNDS,
-    Exposures,
-    apply_colors,
-    compared_pixels,
-    fitted_colors,
-)
+from gsencoder.data.seeding.depth import seed_from_depth
+from gsencoder.reconstruct.optimize import ROUNDS, Exposures, OptimizeConfig, Optimizer, PruneConfig
 from gsencoder.reconstruct.score import (
     camera_weights,
     compare,
@@ -27,6 +19,7 @@ from gsencoder.reconstruct.score import (
     predict_exposures,
     score,
 )
+from gsencoder.render.images import IDENTITY, apply_colors, compared_pixels, fitted_colors
 from gsencoder.types import Views
 
 GAINS = np.array([0.7, 1.25, 1.0, 0.9, 1.15, 1.0])

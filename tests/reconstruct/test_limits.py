@@ -17,9 +17,8 @@ from gsencoder.data.splats.files import save_splat
 from gsencoder.reconstruct import plan as planning
 from gsencoder.reconstruct import reconstruct, sfm
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
-from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, PLAN
 from gsencoder.reconstruct.plan import Costs, ReconstructBudget
-from gsencoder.reconstruct.run import ReconstructConfig
+from gsencoder.reconstruct.run import CHECKPOINT_FILE, PLAN, ReconstructConfig
 from gsencoder.types import Scene
 
 SEEDS = SeedConfig(voxel=0.15)

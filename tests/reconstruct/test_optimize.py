@@ -14,22 +14,24 @@ from walls import NEVER, wall_optimizer, wall_views
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
-from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.optimize import RATES, OptimizeConfig, Optimizer, PruneConfig, rows_to_keep
-from gsencoder.reconstruct.parameters import (
+from gsencoder.data.seeding.depth import seed_from_depth
+from gsencoder.reconstruct.optimize import (
     BETAS,
     EPS,
+    RATES,
     Anchor,
+    OptimizeConfig,
+    Optimizer,
+    PruneConfig,
     RowAdam,
-    State,
     anchor_at,
     camera_of,
     gaussians_of,
-    load_state,
     parameters_from,
     rows_in_view,
-    save_state,
+    rows_to_keep,
 )
+from gsencoder.reconstruct.run import State, load_state, save_state
 from gsencoder.reconstruct.score import score
 from gsencoder.render import blend
 from gsencoder.render.rasterize import RasterConfig
@@ -82,7 +84,7 @@ def test_a_splat_gets_nearer_to_photographs_that_it_was_not_fitted_to() -> None:
     assert after.psnr > before.psnr + 1
     assert after.ssim > before.ssim
     assert set(terms[0]) == {"l1", "ssim", "depth"}
-    assert len(one.gaussians()) == len(seeds())
+    assert len(gaussians_of(one.parameters)) == len(seeds())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -168,7 +170,7 @@ def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
     for _ in range(120):
         one.advance()
     assert all(bool(torch.isfinite(value).all()) for value in one.parameters.values())
-    assert len(one.gaussians()) > 0
+    assert len(gaussians_of(one.parameters)) > 0
 
 
 def test_a_gradient_that_is_not_finite_stops_before_the_step() -> None:

@@ -10,10 +10,10 @@ from walls import cameras, wall_optimizer, wall_views
 
 from gsencoder.core.budget import PLANNED
 from gsencoder.core.errors import InputError
-from gsencoder.data.seeding.seed import seed, seed_from_depth
+from gsencoder.data.seeding.depth import seed_from_depth
+from gsencoder.data.seeding.seed import seed
 from gsencoder.reconstruct import plan as planning
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PhotographGradients, PruneConfig
-from gsencoder.reconstruct.parameters import RowAdam
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PhotographGradients, PruneConfig, RowAdam
 from gsencoder.reconstruct.plan import (
     LEAST_STEPS,
     STEPS_IN_SECONDS,
@@ -128,7 +128,7 @@ def costs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def planned(optimizer: Optimizer, budget: ReconstructBudget, *, spent: float = 0.0, double: bool = False) -> Plan:
-    return make_plan(optimizer, [0, 3], budget, lambda steps: 2, double_means=double, spent=lambda: spent)
+    return make_plan(optimizer, [0, 3], budget, lambda steps: 2, double_means=double, began=0.0, now=lambda: spent)
 
 
 def test_less_room_first_costs_degrees_of_color_and_then_gaussians(optimizer: Optimizer) -> None:
@@ -212,7 +212,9 @@ def test_seconds_are_kept_for_as_many_validations_as_the_steps_have_and_for_the_
     measured = Costs(steps={1: 3.0, 2: 3.0}, pruning=4.0, validation=6.0, picture=4.0)
     monkeypatch.setattr(planning, "measured_costs", lambda *_: measured)
     budget = ReconstructBudget(seconds=500.0)
-    plan = make_plan(optimizer, [0, 3], budget, lambda steps: 2 + steps // 50, double_means=False, spent=lambda: 20.0)
+    plan = make_plan(
+        optimizer, [0, 3], budget, lambda steps: 2 + steps // 50, double_means=False, began=0.0, now=lambda: 20.0
+    )
     needed = 20 + 12 + 6.0 * (2 + plan.steps // 50) + 4.0 * MAX_COMPARISONS + 3.0 * plan.steps
     # The validations are those of nearly as many steps.
     assert PLANNED * 500 - 15 < needed <= PLANNED * 500 + 6

@@ -11,8 +11,9 @@ from walls import DEPTH, TILT, wall_points, wall_views
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.depth import seed_from_depth
 from gsencoder.data.seeding.from_photographs import DenseConfig
-from gsencoder.data.seeding.seed import SeedConfig, seed_from_depth
+from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct.optimize import OptimizeConfig
 from gsencoder.reconstruct.run import ReconstructConfig, Start, initial_gaussians

@@ -8,11 +8,11 @@ import torch
 from walls import DEPTH, TILT, cameras, wall_optimizer, wall_points, wall_views
 
 from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.depth import seed_from_depth
 from gsencoder.data.seeding.from_photographs import DenseConfig, covered_share, densify, outside_hull
-from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.optimize import RATES, OptimizeConfig, Optimizer, losses_of
-from gsencoder.reconstruct.parameters import IDENTITY
 from gsencoder.reconstruct.score import compare, covisible_pixels, describe, score
+from gsencoder.render.images import IDENTITY
 from gsencoder.render.rasterize import Raster
 from gsencoder.types import Views
 

@@ -14,7 +14,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.readers.colmap import read_colmap
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.reconstruct import sfm as opening
-from gsencoder.reconstruct.parameters import CHECKPOINT_FILE
+from gsencoder.reconstruct.run import CHECKPOINT_FILE
 from gsencoder.reconstruct.sfm import FRAMES_FOLDER, PLACED_FILE, Placed, SfmConfig, find_photographed, open_scene
 from gsencoder.types import Scene
 

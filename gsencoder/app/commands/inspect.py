@@ -22,13 +22,13 @@ from gsencoder.data.check.agreement import agreement_map
 from gsencoder.data.check.epipolar import EpipolarCheck
 from gsencoder.data.check.scene_check import DepthCheck
 from gsencoder.data.labels.mesh import MeshInstances
-from gsencoder.data.readers.label_images import LabelFiles
-from gsencoder.data.readers.layouts import find_splat
+from gsencoder.data.readers.masks import LabelFiles
 from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.scenes import (
     SceneConfig,
     distinct_paths,
     find_scenes,
+    find_splat,
     has_views,
     load_scene,
     read_posed,

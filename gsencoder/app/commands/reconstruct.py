@@ -24,9 +24,15 @@ from gsencoder.data.splats.files import READABLE, save_splat
 from gsencoder.data.video import RECORD_FILE, VideoConfig
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.infer.draw import contact_sheet
-from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
 from gsencoder.reconstruct.plan import choose_scale, refuse_late
-from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
+from gsencoder.reconstruct.run import (
+    CHECKPOINT_FILE,
+    IMAGE_SCALE,
+    ReconstructConfig,
+    Reconstruction,
+    image_scale_of,
+    reconstruct,
+)
 from gsencoder.reconstruct.score import LogRow, Score, describe
 from gsencoder.reconstruct.sfm import FRAMES_FOLDER, OpenedScene, SfmConfig, find_photographed, open_scene
 
@@ -202,7 +208,7 @@ def _at_scale(
         return opened
     data = replace(config.data, image_scale=scale)
     with warnings.catch_warnings():
-        # They were shown when the scene was read at its full size.
+        # They were printed when the scene was read at its full size.
         warnings.simplefilter("ignore", SceneWarning)
         smaller = _open(path, work, config, data, lambda: 0.0, run)
     width, height = (int(np.median(sizes)) for sizes in (views.cameras.widths, views.cameras.heights))

@@ -101,7 +101,7 @@ MAX_ROUNDS = 10  # of repairing and checking again
 def _repair_scene(path: Path, config: RepairConfig, run: Run) -> None:
     """Writes a transforms.json whose poses, depth and cameras fit, and checks that they do."""
     # Only scenes need Pillow and, for some depth sensors, torch.
-    from gsencoder.data.check.findings import repair_posed
+    from gsencoder.data.check.agreement import repair_posed
     from gsencoder.data.check.scene_check import check_scene, findings_of, fit_of, is_decided
     from gsencoder.data.readers.transforms_json import transforms_of
 

@@ -14,8 +14,8 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.process import Track, untracked
-from gsencoder.data.check.findings import ADVICE, Finding, other_orders, other_poses
-from gsencoder.data.readers.undistort import load_pycolmap
+from gsencoder.data.check.agreement import ADVICE, Finding, other_orders, other_poses
+from gsencoder.data.readers.posed import load_pycolmap
 from gsencoder.data.seeding.matches import (
     PairMatches,
     epipolar_distances,
@@ -112,7 +112,7 @@ def judge_matches(
     if enough and best_error > BAD:
         cause, factor, other, error = _best_reading(cameras, all_cameras, rows, near)
         # One view astray among few raises the mean of all pairs, and no reading of all poses mends that.
-        if error < BETTER * best_error and share_that_fits(other, near, _fit_limit(other, near)) >= 0.5:
+        if error < BETTER * best_error and inlier_share(other, near, _fit_limit(other, near)) >= 0.5:
             findings.append(
                 Finding(
                     cause=cause,
@@ -123,7 +123,7 @@ def judge_matches(
             )
             best, best_error, limit = other, error, _fit_limit(other, near)
     findings += _stray_views(best, matches, names, limit)
-    fitting = share_that_fits(best, near, limit)
+    fitting = inlier_share(best, near, limit)
     if best_error > UNFIT and not findings and len(near) >= UNKNOWN_PAIRS and fitting < UNKNOWN_SHARE:
         findings.append(
             Finding(
@@ -238,7 +238,7 @@ def _fit_limit(cameras: Cameras, matches: Sequence[PairMatches]) -> float:
     return float(np.clip(FIT_FACTOR * _usual_error(cameras, matches), *FIT_RANGE))
 
 
-def share_that_fits(cameras: Cameras, matches: Sequence[PairMatches], limit: float) -> float:
+def inlier_share(cameras: Cameras, matches: Sequence[PairMatches], limit: float) -> float:
     """The share of matches that are in pairs that fit."""
     counts = np.array([len(pair.first_pixels) for pair in matches])
     return float(counts[[_fits(cameras, pair, limit) for pair in matches]].sum() / counts.sum())
@@ -249,8 +249,7 @@ def _fits(cameras: Cameras, pair: PairMatches, limit: float) -> bool:
 
 
 def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequence[str], limit: float) -> list[Finding]:
-    """Views whose nearest pairs do not fit, those of the others do, and which have another pose that fits; of fewer
-    than four views it cannot be said which one it is."""
+    """Views, of four or more, whose nearest pairs do not fit, and which have another pose that does."""
     findings: list[Finding] = []
     remaining = [(pair, _fits(cameras, pair, limit)) for pair in matches]
     views = {view for pair in matches for view in (pair.first, pair.second)}
@@ -266,7 +265,7 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
                 if view in (pair.first, pair.second) and (fits or trusted & {pair.first, pair.second})
             ]
             own = near_pairs(cameras, own, view)
-            if len(own) < 2 or len(others) < 3 or share_that_fits(cameras, own, limit) >= STRAY_SHARE:
+            if len(own) < 2 or len(others) < 3 or inlier_share(cameras, own, limit) >= STRAY_SHARE:
                 continue
             # A second view that is astray is in few of the others' pairs.
             usual = _usual_error(cameras, near_pairs(cameras, [pair for pair, _ in others]))
@@ -275,7 +274,7 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
         for error, usual, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
             moved = fit_pose_to_matches(cameras, view, own)
             fitting, after = sum(_fits(moved, pair, limit) for pair in own), mean_error(moved, own)
-            if fitting >= 2 and share_that_fits(moved, own, limit) >= MOVED_SHARE and after < error / 2:
+            if fitting >= 2 and inlier_share(moved, own, limit) >= MOVED_SHARE and after < error / 2:
                 message = (
                     f"its photograph does not fit its pose: its matches lie {error:.1f} pixels from their epipolar "
                     f"lines, {after:.1f} if it is moved, and those of the other views {usual:.1f}"

@@ -11,23 +11,27 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.process import Track, untracked
 from gsencoder.data.check.agreement import (
+    ADVICE,
     CLIP,
     Agreement,
     DepthViews,
+    Finding,
+    Reading,
     RegistrationFit,
     color_correlations,
     depth_at,
     depth_views,
     fit_registration,
     grey_picture,
+    other_readings,
+    reading_of_files,
     residuals,
     view_correlations,
     world_samples,
 )
 from gsencoder.data.check.epipolar import EpipolarCheck, check_matches
-from gsencoder.data.check.findings import ADVICE, Finding, Reading, other_readings, reading_of_files
 from gsencoder.types import Cameras, Scene, Views
-from gsencoder.types.checks import invert_rigid, transform
+from gsencoder.types.scene import invert_rigid, transform
 
 REACHES = (0.15,) * 4 + (0.1,) * 4 + (0.07,) * 3 + (0.05, 0.04, 0.03, 0.03, 0.03)
 """Samples are matched to the surface on their pixel's ray in another view if its depth differs by at most this share,
@@ -115,8 +119,6 @@ BETTER = 0.95  # Another reading of the files is named if its spread is below th
 SMALLEST_FACTOR = 1.015  # Factors nearer to one are within what sensors are calibrated to
 UNFIT = 0.5  # If a smaller share of the depth agrees under every reading, poses and depth do not belong together
 CLEAR = 0.7  # Where the files' own reading compares nothing, another one is named if this share agrees under it
-COMPARABLE = 0.02
-"""Samples that land in another view, as a share of all pairs, below which depth says nothing about poses."""
 STRAY, STRAY_SPREAD = 0.9, 0.002
 """A view is astray if moving it brings its spread below this share, and it is above what pixels alone make."""
 SUSPECTS = 8  # Views, of the worst fit, that are tried to be moved
@@ -152,7 +154,7 @@ class DepthCheck:
     @property
     def comparable(self) -> bool:
         """Whether enough of the depth lands in other views for a judgement."""
-        return self.best.compared >= _needed(self.depth)
+        return self.best.compared >= self.depth.min_compared
 
 
 def check_scene(
@@ -212,7 +214,7 @@ def warn_of_faults(scene: Scene) -> None:
     if views is None:
         return
     finding = wrong_size(views.cameras)
-    if finding is None and views.depths is not None and len(views) > 1:
+    if finding is None and views.depths is not None and len(views.names) > 1:
         finding = suspicious_depth(views)[1]
     if finding is not None:
         mends = "" if finding.cause == "unknown" else ", and gsencoder repair can mend it"
@@ -232,7 +234,7 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
     small = depth_views(views, rows)
     given = reading_of_files(small)
     best = _best_reading(given, small, rows, views)
-    comparable = best.agreement.compared >= _needed(small)
+    comparable = best.agreement.compared >= small.min_compared
     findings = _reading_findings(given, best) if comparable else []
     fits = comparable and best.agreement.share >= UNFIT
     stray = _stray_views(best.views, names) if fits else []
@@ -266,22 +268,17 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
     )
 
 
-def suspicious_depth(views: Views, *, limit: int = 10) -> tuple[Agreement, Finding | None]:
+def suspicious_depth(views: Views) -> tuple[Agreement, Finding | None]:
     """A quick look at few views: how well their depth agrees and, if not well, the likely cause."""
-    rows = even_indices(len(views), limit)
+    rows = even_indices(len(views), 10)
     small = depth_views(views, rows)
     given = reading_of_files(small)
-    if given.agreement.compared >= _needed(small) and given.agreement.share >= SUSPICIOUS:
+    if given.agreement.compared >= small.min_compared and given.agreement.share >= SUSPICIOUS:
         return given.agreement, None
     best = _best_reading(given, small, rows, views)
-    if best.agreement.compared < _needed(small):
+    if best.agreement.compared < small.min_compared:
         return given.agreement, None
     return given.agreement, next(iter(_reading_findings(given, best)), None)
-
-
-def _needed(views: DepthViews) -> float:
-    """The number of samples that must land in other views before their depth says anything."""
-    return COMPARABLE * len(views) * (len(views) - 1) * views.values.shape[1]
 
 
 def _best_reading(given: Reading, depth: DepthViews, rows: Int64[np.ndarray, " V"], views: Views) -> Reading:
@@ -289,13 +286,13 @@ def _best_reading(given: Reading, depth: DepthViews, rows: Int64[np.ndarray, " V
     candidates = [
         reading
         for reading in other_readings(depth, rows, views.cameras.cam_from_world)
-        if reading.agreement.compared >= _needed(depth)
+        if reading.agreement.compared >= depth.min_compared
         and (
             reading.cause == "order" or reading.factor is None or abs(np.log(reading.factor)) >= np.log(SMALLEST_FACTOR)
         )
     ]
     best = min(candidates, key=lambda reading: reading.agreement.spread, default=given)
-    if given.agreement.compared < _needed(depth):
+    if given.agreement.compared < depth.min_compared:
         # Views that share nothing are no fault; only a reading under which they agree says that they should.
         return best if best.agreement.share >= CLEAR else given
     return best if best.agreement.spread < BETTER * given.agreement.spread else given
@@ -318,8 +315,7 @@ def _reading_findings(given: Reading, best: Reading) -> list[Finding]:
 
 
 def _with_registration(findings: list[Finding], fit: RegistrationFit) -> list[Finding]:
-    """The findings, and that depth and photographs are not registered; a focal length that is wrong for both is one
-    finding."""
+    """The findings with that of the registration; a focal length that is wrong for both is one finding."""
     if not fit.differs:
         return findings
     correlations = f"details of the photographs correlate by {fit.given:.2f} across views, {fit.best:.2f} if so"
@@ -336,8 +332,7 @@ def _with_registration(findings: list[Finding], fit: RegistrationFit) -> list[Fi
 
 
 def _stray_views(views: DepthViews, names: tuple[str, ...]) -> list[Finding]:
-    """Views that fit clearly better once they are moved; the worst are tried first, and others without
-    the views that are astray."""
+    """Views that fit clearly better once they are moved, worst first; others are tried without those."""
     suspects = np.argsort(-np.nan_to_num(view_spreads(residuals(views))))[:SUSPECTS]
     normals = [surface_normals(views, view) for view in range(len(views))]
     findings, rows = [], list(range(len(views)))

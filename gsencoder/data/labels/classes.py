@@ -55,7 +55,7 @@ class ClassTable:
         return dict(zip(self.names, self.ids, strict=True))
 
     def without(self, names: Collection[str]) -> "ClassTable":
-        """The table without some names, those that it does not have are passed over."""
+        """The table without some names; names that it does not have are passed over."""
         rows = [row for row, name in enumerate(self.names) if name not in names]
         return ClassTable(
             names=tuple(self.names[row] for row in rows),
@@ -175,7 +175,7 @@ def vertex_classes(
 
 
 def read_instance_classes(path: Path) -> ClassTable:
-    """Those classes of a list that NAME_instance.txt beside NAME.txt names too, with the ids of the list."""
+    """Those classes of a list that NAME_instance.txt next to NAME.txt names too, with the ids of the list."""
     every, instance_list = read_class_list(path), path.with_name(f"{path.stem}_instance.txt")
     names = read_class_list(instance_list).names
     foreign = [name for name in names if name not in every.names]
@@ -222,7 +222,7 @@ def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
         classes: scannet20, scannet200, a CSV file with the columns id, name and group where classes have groups, or a
             list of names (.txt) such as ScanNet++'s top100.txt, whose ids count its lines from 0.
         instances: whether instances are scored: the benchmarks then leave out wall and floor, so that 18 and 198
-            classes remain. Of a list those in NAME_instance.txt beside it; those of a CSV file are all scored.
+            classes remain. Of a list those in NAME_instance.txt next to it; those of a CSV file are all scored.
     """
     path = Path(classes)
     if classes in COLUMNS:

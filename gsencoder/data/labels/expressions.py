@@ -27,6 +27,7 @@ from gsencoder.data.labels.files import (
     Entry,
     annotation_id,
     box_corners,
+    brief,
     corner_bounds,
     entries_of,
     flag_value,
@@ -36,7 +37,6 @@ from gsencoder.data.labels.files import (
     read_rows,
     refuse_repeated,
     scene_name,
-    shown,
     text_list,
     text_value,
 )
@@ -163,7 +163,7 @@ def _literal_tokens(text: str, where: str) -> tuple[str, ...]:
     except (ValueError, SyntaxError, RecursionError, MemoryError):
         value = None
     if not isinstance(value, list):
-        raise InputError(f"{where}: tokens must be a list of words such as ['the', 'chair'], got {shown(text)}")
+        raise InputError(f"{where}: tokens must be a list of words such as ['the', 'chair'], got {brief(text)}")
     return text_list(value, where, "tokens", empty=True)
 
 

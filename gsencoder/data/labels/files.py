@@ -70,7 +70,7 @@ CHUNK = 1 << 20
 NO_NUMBER = re.compile(rb"^(?![ \t]*[+-]?[0-9]+[ \t]*\r?$)", re.MULTILINE)
 
 
-def read_whole_numbers(path: Path, *, hint: str = "") -> Int64[np.ndarray, " n"]:
+def read_integer_lines(path: Path, *, hint: str = "") -> Int64[np.ndarray, " n"]:
     """The numbers of a file with one a line, from -LARGEST to LARGEST.
 
     Args:
@@ -104,18 +104,11 @@ def _parsed(path: Path, data: bytes, hint: str) -> Int64[np.ndarray, " n"]:
     return values
 
 
-def write_whole_numbers(path: Path, values: Int[np.ndarray, " n"]) -> None:
+def write_integer_lines(path: Path, values: Int[np.ndarray, " n"]) -> None:
     """Writes one number a line, atomically."""
     with atomic_file(path) as stream:
         for start in range(0, len(values), CHUNK):
             stream.write("".join(f"{value}\n" for value in values[start : start + CHUNK].tolist()).encode())
-
-
-def mask_bytes(mask: Bool[np.ndarray, " n"]) -> bytes:
-    """A mask as text, 0 or 1 a line."""
-    codes = np.full((len(mask), 2), ord("\n"), np.uint8)
-    codes[:, 0] = mask + ord("0")
-    return codes.tobytes()
 
 
 def read_rows(
@@ -163,7 +156,7 @@ def entries_of(rows: Any, path: Path, expected: str, *, key: str = "") -> tuple[
     """
     if not isinstance(rows, list):
         expectation = f"{key} must be" if key else "expected"
-        raise InputError(f"{path}: {expectation} a list of objects with {expected}, got {shown(rows)}")
+        raise InputError(f"{path}: {expectation} a list of objects with {expected}, got {brief(rows)}")
     wheres = [f"{path}: {key}[{index}]" if key else f"{path}: entry {index}" for index in range(len(rows))]
     return tuple((object_of(row, where, expected), where) for row, where in zip(rows, wheres, strict=True))
 
@@ -175,7 +168,7 @@ def refuse_repeated(path: Path, keys: Iterable[Hashable], name: Callable[[Any], 
         raise InputError(f"{path}: entries {first} and {second} have one {what}: {name(key)}; expected each once")
 
 
-def shown(value: Any) -> str:
+def brief(value: Any) -> str:
     """A value for a message, on one line and cut off; the type alone of what may be large."""
     if isinstance(value, (list, dict)):
         return "a list" if isinstance(value, list) else "an object"
@@ -185,17 +178,17 @@ def shown(value: Any) -> str:
 def object_of(value: Any, where: str, expected: str) -> Mapping[str, Any]:
     """The value, which must be a JSON object."""
     if not isinstance(value, dict):
-        raise InputError(f"{where}: expected an object with {expected}, got {shown(value)}")
+        raise InputError(f"{where}: expected an object with {expected}, got {brief(value)}")
     return value
 
 
 def text_value(value: Any, where: str, field: str, *, empty: bool = False) -> str:
     """The value, which must be a text of at most `MAX_TEXT` characters, and not of blanks alone unless `empty`."""
     if not isinstance(value, str):
-        raise InputError(f"{where}: {field} must be a text, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be a text, got {brief(value)}")
     if len(value) > MAX_TEXT:
         raise InputError(
-            f"{where}: {field} has {len(value):,} characters, expected at most {MAX_TEXT:,}: {shown(value)}"
+            f"{where}: {field} has {len(value):,} characters, expected at most {MAX_TEXT:,}: {brief(value)}"
         )
     if not empty and not value.strip():
         raise InputError(f"{where}: {field} is empty; expected a text")
@@ -205,7 +198,7 @@ def text_value(value: Any, where: str, field: str, *, empty: bool = False) -> st
 def text_list(value: Any, where: str, field: str, *, empty: bool = False) -> tuple[str, ...]:
     """The value, which must be a list of texts; `empty` as in `text_value`, for each of them."""
     if not isinstance(value, list):
-        raise InputError(f"{where}: {field} must be a list of texts, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be a list of texts, got {brief(value)}")
     return tuple(text_value(each, where, f"{field}[{index}]", empty=empty) for index, each in enumerate(value))
 
 
@@ -213,7 +206,7 @@ def scene_name(value: Any, where: str) -> str:
     """The name of a scene, such as scene0011_00."""
     name = text_value(value, where, "the scene")
     if name in (".", "..") or "/" in name or len(name) > 255 or not name.isprintable():
-        raise InputError(f"{where}: the scene must be a name that a folder can have, got {shown(name)}")
+        raise InputError(f"{where}: the scene must be a name that a folder can have, got {brief(name)}")
     return name
 
 
@@ -234,7 +227,7 @@ def name_value(value: Any, where: str, field: str, *, expected: str = "a text") 
     """The name of a class: a text of one line."""
     if not isinstance(value, str) or not value.strip() or not value.isprintable() or len(value) > MAX_ID:
         raise InputError(
-            f"{where}: {field} must be {expected} of one line with 1 to {MAX_ID} characters, got {shown(value)}"
+            f"{where}: {field} must be {expected} of one line with 1 to {MAX_ID} characters, got {brief(value)}"
         )
     return value
 
@@ -244,7 +237,7 @@ def flag_value(value: Any, where: str, field: str) -> bool | None:
     if value is None:
         return None
     if not isinstance(value, int) or value not in (0, 1):
-        raise InputError(f"{where}: {field} must be 0 or 1, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be 0 or 1, got {brief(value)}")
     return bool(value)
 
 
@@ -254,15 +247,15 @@ def object_id(value: Any, where: str, field: str = "object_id") -> int:
         return int(value)
     if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31:
         return value
-    raise InputError(f"{where}: {field} must be a whole number from 0, got {shown(value)}")
+    raise InputError(f"{where}: {field} must be a whole number from 0, got {brief(value)}")
 
 
 def number(value: Any, where: str, field: str, *, largest: float = 1e15) -> float:
     """A finite number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"{where}: {field} must be a number, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be a number, got {brief(value)}")
     if not abs(value) <= largest or not math.isfinite(value):
-        raise InputError(f"{where}: {field} must be a finite number of at most {largest:g}, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be a finite number of at most {largest:g}, got {brief(value)}")
     return float(value)
 
 
@@ -274,12 +267,12 @@ def corner_bounds(value: Any, where: str, field: str) -> tuple[Corner, Corner]:
     if len(rows) not in (2, 8):
         raise InputError(
             f"{where}: {field} must be a list of 8 corners [x, y, z], or of a lower and an upper one, got "
-            f"{shown(value)}"
+            f"{brief(value)}"
         )
     corners = []
     for row, corner in enumerate(rows):
         if not isinstance(corner, list) or len(corner) != 3:
-            raise InputError(f"{where}: {field}[{row}] must be a corner [x, y, z], got {shown(corner)}")
+            raise InputError(f"{where}: {field}[{row}] must be a corner [x, y, z], got {brief(corner)}")
         corners.append([number(each, where, f"{field}[{row}]", largest=MAX_COORDINATE) for each in corner])
     lower, upper = ([pick(axis) for axis in zip(*corners, strict=True)] for pick in (min, max))
     if len(corners) == 2 and lower != corners[0]:

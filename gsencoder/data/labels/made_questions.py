@@ -4,7 +4,7 @@ A question is made only where people would agree on its answer:
 
 - A thing is asked about if some photograph shows at least `min_pixels` of it, by its name, if no other name of the
   scene may stand for the same thing (`alike`). "The" thing is the only one of its name in the labels.
-- next_to: the nearest thing beside it, at most 0.5 m away, and nearer than any of another name by 0.1 m and by half
+- next_to: the nearest thing to it, at most 0.5 m away, and nearer than any of another name by 0.1 m and by half
   (`seen_objects.neighbor`).
 - how_many: every object of the name that any photograph shows is well visible; at most ten.
 - color: nearly all pixels of it have one color word in every photograph that shows it well (`seen_objects.color_word`).
@@ -483,7 +483,7 @@ def _ways_to_say(scene: SeenScene, scene_object: SeenObject, near: Mapping[int, 
 def _anchor(
     scene: SeenScene, scene_object: SeenObject, others: Sequence[SeenObject], scene_objects: Sequence[SeenObject]
 ) -> SeenObject | None:
-    """The nearest thing beside another whose name is its own and that no other object of the name is as near to."""
+    """The nearest thing to another whose name is its own and that no other object of the name is as near to."""
     if not others:
         # The one thing of a name is next to what the question's rule says, too.
         near = neighbor(scene_object, scene_objects)

@@ -22,7 +22,7 @@ from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files import check_foreign
 from gsencoder.core.threads import compiled
 from gsencoder.types import MeshLabels, Views
-from gsencoder.types.checks import move_origin, transform
+from gsencoder.types.scene import move_origin, transform
 
 
 def read_mesh(path: Path) -> tuple[Float32[np.ndarray, "V 3"], Int32[np.ndarray, "F 3"] | None]:
@@ -175,7 +175,7 @@ def labels_of_vertices(
 
     Args:
         means: centers of the Gaussians, in the frame of the vertices.
-        voters: which Gaussians are looked at, such as those that were seen; None = all.
+        voters: which Gaussians are looked at, such as the visible ones; None = all.
     """
     if voters is not None:
         means, labels = means[voters], labels[voters]

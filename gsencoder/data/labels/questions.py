@@ -16,6 +16,7 @@ from gsencoder.core.files import write_json
 from gsencoder.data.labels.expressions import PREDICTED
 from gsencoder.data.labels.files import (
     Corner,
+    brief,
     entries_of,
     id_value,
     number,
@@ -24,7 +25,6 @@ from gsencoder.data.labels.files import (
     read_benchmark_json,
     refuse_repeated,
     scene_name,
-    shown,
     text_list,
     text_value,
 )
@@ -62,7 +62,7 @@ def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question
     """Reads ScanQA's file or SQA3D's file of questions, by what is in it.
 
     Args:
-        path: the file; SQA3D's annotations lie beside it.
+        path: the file; SQA3D's annotations lie next to it.
         answered: whether answers are needed; without, SQA3D's annotations are not read.
     """
     file = Path(path)
@@ -73,7 +73,7 @@ def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question
         return _sqa3d(content, file, answered)
     hint = "; these are SQA3D's annotations: give the file of questions beside them"
     raise InputError(
-        f"{file}: expected ScanQA's list of questions or SQA3D's object with questions, got {shown(content)}"
+        f"{file}: expected ScanQA's list of questions or SQA3D's object with questions, got {brief(content)}"
         + (hint if isinstance(content, dict) and "annotations" in content else "")
     )
 
@@ -103,7 +103,7 @@ def _scanqa(rows: Any, path: Path, answered: bool) -> tuple[Question, ...]:
             raise InputError(f"{where}: expected a question, got {swapped}: these are predictions; were both swapped?")
         ids = entry.get("object_ids", [])
         if not isinstance(ids, list):
-            raise InputError(f"{where}: object_ids must be a list of whole numbers, got {shown(ids)}")
+            raise InputError(f"{where}: object_ids must be a list of whole numbers, got {brief(ids)}")
         questions.append(
             Question(
                 dataset="scanqa",
@@ -147,7 +147,7 @@ def _sqa3d(content: Mapping[str, Any], path: Path, answered: bool) -> tuple[Ques
         )
     content = read_benchmark_json(annotations)
     if not isinstance(content, dict) or "annotations" not in content:
-        raise InputError(f"{annotations}: expected SQA3D's object with a list of annotations, got {shown(content)}")
+        raise InputError(f"{annotations}: expected SQA3D's object with a list of annotations, got {brief(content)}")
     rows = entries_of(content["annotations"], annotations, "question_id and answers", key="annotations")
     ids = [id_value(entry.get("question_id"), where, "question_id") for entry, where in rows]
     _refuse_repeated(annotations, ids)
@@ -171,7 +171,7 @@ def _annotated(question: Question, entry: Mapping[str, Any], where: str) -> Ques
         )
     rows = entry.get("answers")
     if not isinstance(rows, list) or not rows:
-        raise InputError(f"{where}: answers must be a list of objects with an answer, got {shown(rows)}")
+        raise InputError(f"{where}: answers must be a list of objects with an answer, got {brief(rows)}")
     answers = (object_of(row, where, "an answer").get("answer") for row in rows)
     position = object_of(entry.get("position"), where, "x, y and z as its position")
     rotation = object_of(entry.get("rotation"), where, "_x, _y, _z and _w as its rotation")
@@ -196,7 +196,7 @@ def write_sqa3d(path: str | Path, questions: Sequence[Question]) -> Path:
         path: of the file of questions, whose name must have "questions" in it.
 
     Returns:
-        The file of annotations beside it, where `read_questions` looks for it.
+        The file of annotations next to it, where `read_questions` looks for it.
     """
     file = Path(path)
     annotations = file.with_name(file.name.replace("questions", SITUATED))

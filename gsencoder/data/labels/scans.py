@@ -26,9 +26,9 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, counted
-from gsencoder.data.labels.files import check_file, entries_of, read_checked_text, shown
+from gsencoder.data.labels.files import brief, check_file, entries_of, read_checked_text
 from gsencoder.data.labels.mesh import MeshInstances, read_mesh
-from gsencoder.data.readers.label_images import label_files, members_by_stem, read_member
+from gsencoder.data.readers.masks import label_files, members_by_stem, read_member
 from gsencoder.data.readers.posed import rigid_pose
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.types import MeshLabels, Scene, SceneObject, Views
@@ -63,15 +63,15 @@ def read_groups(path: Path, *, first_id: int) -> tuple[SegmentGroup, ...]:
     for row, where in entries_of(rows, path, "objectId, label and segments", key="segGroups"):
         number, label = row.get("objectId"), row.get("label")
         if isinstance(number, bool) or not isinstance(number, int) or not first_id <= number <= MAX_ID:
-            raise InputError(f"{where}: objectId must be a whole number from {first_id}, got {shown(number)}")
+            raise InputError(f"{where}: objectId must be a whole number from {first_id}, got {brief(number)}")
         of_object = f"{where} (objectId {number})"
         if not isinstance(label, str):
-            raise InputError(f"{of_object}: label must be a name, got {shown(label)}")
+            raise InputError(f"{of_object}: label must be a name, got {brief(label)}")
         if len(label) > MAX_NAME:
             raise InputError(f"{of_object}: label has {len(label):,} characters, expected at most {MAX_NAME:,}")
         segments = row.get("segments")
         if not isinstance(segments, list):
-            raise InputError(f"{of_object}: segments must be a list of numbers of segments, got {shown(segments)}")
+            raise InputError(f"{of_object}: segments must be a list of numbers of segments, got {brief(segments)}")
         if not segments:
             raise InputError(f"{of_object}: {label[:40]!r} has no segments; remove it, or get the annotation again")
         groups.append(SegmentGroup(number, label, np.unique(_integers(segments, f"{of_object}: segments"))))
@@ -99,7 +99,7 @@ def _integers(values: list[Any], where: str) -> Int64[np.ndarray, " n"]:
         with suppress(OverflowError):
             return np.array(values, np.int64)
     wrong = next(row for row, each in enumerate(values) if type(each) is not int or not -(2**63) <= each < 2**63)
-    raise InputError(f"{where}[{wrong}]: expected a whole number, got {shown(values[wrong])}")
+    raise InputError(f"{where}[{wrong}]: expected a whole number, got {brief(values[wrong])}")
 
 
 AGGREGATION, SEGMENTS, MESH = ".aggregation.json", "_vh_clean_2.0.010000.segs.json", "_vh_clean_2.ply"
@@ -299,10 +299,8 @@ def labels_of_scan(folder: Path, raw_names: Collection[str]) -> MeshLabels:
 def labels_of_layout(folder: Path, layout: str) -> MeshLabels | None:
     """The labels next to the photographs of a scene, in the world of its poses.
 
-    Only the layouts ScanNet and ScanNet++ have labels. A warning says where an annotation lacks files that it needs.
+    The layout is ScanNet or ScanNet++. A warning says where an annotation lacks files that it needs.
     """
-    if layout not in ("ScanNet", "ScanNet++"):
-        return None
     files = find_scannet_files(folder) if layout == "ScanNet" else find_scannetpp_files(folder)
     if files is None:
         return None
@@ -352,7 +350,7 @@ def objects_of_labels(labels: MeshLabels) -> tuple[SceneObject, ...]:
 
 def with_archived_instances(views: Views, folder: Path) -> Views:
     """Views of a ScanNet scan with the instance maps of SCAN_2d-instance-filt.zip, or else of SCAN_2d-instance.zip,
-    where one lies beside the annotation, has a picture in the photographs' size for each view, and the views have no
+    where one lies next to the annotation, has a picture in the photographs' size for each view, and the views have no
     pictures of instances of their own.
     """
     scan = find_scannet_files(folder)

@@ -75,7 +75,7 @@ def color_counts(pixels: UInt8[np.ndarray, "n 3"]) -> Int64[np.ndarray, " C"]:
 
 
 COLOR_VIEWS = 4
-"""Photographs that a thing's color is read from: those that show most of it."""
+"""Photographs that a thing's color is read from: the ones that show most of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,7 +126,7 @@ class SeenScene:
 
 
 def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
-    """Counts the pixels of each object in the photographs, and reads the color of those that are well visible.
+    """Counts the pixels of each object in the photographs, and reads the color of the well visible ones.
 
     Args:
         scene: with labeled objects, instance maps and photographs, up = z.
@@ -195,7 +195,7 @@ TOUCHING = 0.04
 ON_SHARE = 0.6
 """… and this share of its outline lies within the other's."""
 SAME_PLACE = 0.3
-"""Things whose boxes share more than this of the smaller one's volume are in or around each other, not beside."""
+"""Things whose boxes share more than this of the smaller one's volume are in or around each other, not next to."""
 REACH = 1.0
 """Things farther apart than this, which is beyond what `clearly_nearer` asks of `NEAR`, do not decide any relation."""
 LARGEST = 1.3

@@ -19,8 +19,17 @@ from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files import MODEL_BYTES, open_foreign, read_foreign
-from gsencoder.data.readers.posed import PosedImage, PosedImages, ReadOptions, inside, rigid_pose, warn_left_out
-from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
+from gsencoder.data.readers.posed import (
+    CameraModel,
+    PosedImage,
+    PosedImages,
+    ReadOptions,
+    check_camera,
+    inside,
+    load_pycolmap,
+    rigid_pose,
+    warn_left_out,
+)
 
 CAMERA_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,

@@ -34,23 +34,23 @@ from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError, listed
 from gsencoder.core.files import read_foreign_text, warn_if_modified
-from gsencoder.data.readers.images import picture_info, picture_size
+from gsencoder.data.readers.images import picture_info
 from gsencoder.data.readers.posed import (
+    CameraModel,
     PosedImage,
     PosedImages,
     ReadOptions,
+    focal_count,
     inside,
     number,
     numbers,
-    rigid_pose,
+    pose_in,
     warn_left_out,
 )
-from gsencoder.data.readers.undistort import CameraModel, check_camera, focal_count
 from gsencoder.data.splats.ply import read_points
 from gsencoder.types import Cameras, SceneObject
-from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid, move_origin
 from gsencoder.types.orientation import EXCHANGED
-from gsencoder.types.scene import intrinsic_matrix
+from gsencoder.types.scene import OPENCV_FROM_OPENGL, intrinsic_matrix, invert_rigid, move_origin
 
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 NERFSTUDIO_DEPTH_SCALE = 1e-3  # nerfstudio's own default for depth_unit_scale_factor: integer millimetres
@@ -62,16 +62,18 @@ CAMERA_KEYS = {
     "depth_from_color", "depth_measure", "no_depth",
 }  # fmt: skip
 FILES_OF_FRAME = {
+    "image": (("file_path",), "listed images", "their frames are left out"),
     "depth": (("depth_file_path", "depth_path"), "listed depth files", "those views have no depth"),
     "mask": (("mask_path",), "listed masks", "all pixels of those views are used"),
     "instance": (("instance_file_path",), "listed instance maps", "those views have no instances"),
 }
 """By field of `PosedImage`: the keys of its file, and what is said where such files are missing."""
 FILE_KEYS = {"frames", "metres_per_unit", "up", "ply_file_path"}
-FRAME_KEYS = {"file_path", "transform_matrix", *(key for keys, *_ in FILES_OF_FRAME.values() for key in keys)}
+FRAME_KEYS = {"transform_matrix", *(key for keys, *_ in FILES_OF_FRAME.values() for key in keys)}
 """Keys that are read here: of cameras, for the file or a frame, and of one of these alone."""
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # The names that such files have
+OBJECTS_FILE = "objects.json"  # Next to one, the labeled objects of the scene
 
 
 def read_json(path: Path, *, unique_keys: bool = False) -> Any:
@@ -113,7 +115,6 @@ def read_transforms(
     homes = {"mask": masks} if masks is not None and masks.is_dir() else {}
     images: list[PosedImage] = []
     missing: dict[str, list[str]] = {kind: [] for kind in FILES_OF_FRAME}
-    without_image: list[str] = []
     names: set[str] = set()
     metric_depth = False
     for index, frame in enumerate(frames):
@@ -131,12 +132,13 @@ def read_transforms(
         )
         image = next((file for file in candidates if file.is_file()), None)
         if image is None:
-            without_image.append(name)
+            missing["image"].append(name)
             continue
+        world_from_cam = pose_in(frame, "transform_matrix", where) @ OPENCV_FROM_OPENGL
         files: dict[str, Path | None] = dict.fromkeys(FILES_OF_FRAME)
         for kind, (keys, *_) in FILES_OF_FRAME.items():
             key = next((key for key in keys if frame.get(key) is not None), None)
-            if key is None:
+            if key is None or kind == "image":
                 continue
             if not isinstance(frame[key], str):
                 raise InputError(f"{where}: {key} must be a path, got {str(frame[key])[:40]!r}")
@@ -150,7 +152,7 @@ def read_transforms(
             PosedImage(
                 name=name,
                 camera=_camera(data, frame, image, where),
-                cam_from_world=invert_rigid(_pose(frame, "transform_matrix", where) @ OPENCV_FROM_OPENGL),
+                cam_from_world=invert_rigid(world_from_cam),
                 image=image,
                 mask=files["mask"],
                 instance=files["instance"],
@@ -158,10 +160,10 @@ def read_transforms(
             )
         )
     if not images:
-        raise InputError(f"{path}: none of the {len(frames)} listed images exists (first: {without_image[0][:200]!r})")
-    warn_left_out(without_image, len(frames), path.name, "listed images", "their frames are left out")
-    for kind, (_, *words) in FILES_OF_FRAME.items():
-        warn_left_out(missing[kind], len(frames), path.name, *words)
+        raise InputError(f"{path}: none of the {len(frames)} listed images exists (first: {name[:200]!r})")
+    for kind, names_missing in missing.items():
+        if names_missing:
+            warn_left_out(names_missing, len(frames), path.name, *FILES_OF_FRAME[kind][1:])
     points, colors, points_file = _points(data, path, allow_outside=allow_outside)
     metres, up = number(data, "metres_per_unit", str(path)), None
     if metres is not None and metres <= 0:
@@ -182,6 +184,7 @@ def read_transforms(
         points=points,
         colors=colors,
         points_file=points_file,
+        objects=read_objects(root / OBJECTS_FILE) if os.path.lexists(root / OBJECTS_FILE) else (),
         unused=_unused_keys(path, data, frames),
     )
 
@@ -205,7 +208,7 @@ def _depth(values: dict[str, Any], frame: dict[str, Any], depth: Path | None, wh
             raise InputError(f"{where}: depth_camera must be an object with fl_x, fl_y, cx and cy")
         camera = _camera({}, camera_keys, depth, f"{where}: depth_camera")
     if from_color is not None:
-        from_color = _pose(values, "depth_from_color", f"{where}: depth_from_color")
+        from_color = pose_in(values, "depth_from_color", f"{where}: depth_from_color")
     return {
         "depth": depth,
         "depth_camera": camera,
@@ -219,8 +222,7 @@ def _depth(values: dict[str, Any], frame: dict[str, Any], depth: Path | None, wh
 def _points(
     data: dict[str, Any], path: Path, *, allow_outside: bool
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "_ 3"], Path | None]:
-    """The points that `ply_file_path` names, their colors if they have any, and the file; in the world of the matrices,
-    as nerfstudio writes them."""
+    """The points that `ply_file_path` names, in the world of the matrices, their colors if any, and the file."""
     name, none = data.get("ply_file_path"), (np.zeros((0, 3)), np.zeros((0, 3), np.uint8), None)
     if name is None or name == "":
         return none
@@ -240,13 +242,6 @@ def _unused_keys(path: Path, data: dict[str, Any], frames: list[dict[str, Any]])
     of_frames = dict.fromkeys(key for frame in frames for key in frame if key not in FRAME_KEYS | CAMERA_KEYS)
     lists = ((of_file, f"key {{}} of {path.name}"), (of_frames, f"key {{}} of the frames of {path.name}"))
     return tuple(form.format(key[:40]) for keys, form in lists for key in keys)
-
-
-def _pose(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:
-    """A rigid transform of 4 rows, or of the upper 3."""
-    rows, pose = numbers(values, key, where, (4, 4), (3, 4)), np.eye(4)
-    pose[: len(rows)] = rows
-    return rigid_pose(pose, where)
 
 
 def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> CameraModel:
@@ -277,16 +272,15 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
         camera = CameraModel(model="FULL_OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
     else:
         camera = CameraModel(model="OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2))
-    check_camera(camera, where)
     return camera
 
 
 def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[int, int]:
     """The size of the picture that intrinsics are of: as its pixels are stored, or of the upright picture, where only
     that has that width and height, or else, of the two, where the principal point is as far right as down."""
-    stored = picture_size(image)
     w, h, cx, cy = (number(values, key, where) for key in ("w", "h", "cx", "cy"))
-    is_sideways = image.suffix.lower() != ".npy" and picture_info(image)[2] in EXCHANGED
+    stored, _, orientation = picture_info(image)
+    is_sideways = orientation in EXCHANGED
     sizes = [
         size for size in (stored, stored[::-1])[: 1 + is_sideways] if w in (None, size[0]) and h in (None, size[1])
     ]
@@ -443,11 +437,11 @@ def read_cameras(path: Path, origin: Float64[np.ndarray, "3"]) -> Cameras:
                 f"{where}: expected an object with cam_from_world or transform_matrix, and {', '.join(INTRINSICS)}, "
                 f"got {listed([str(key)[:40] for key in keys]) or str(entry)[:40]}"
             )
-        pose = _pose(values, pose_key, where)
+        pose = pose_in(values, pose_key, where)
         if pose_key == "transform_matrix":
             pose = invert_rigid(pose @ OPENCV_FROM_OPENGL)
-        stated = {"camera": [values[key] for key in INTRINSICS]}
-        fx, fy, cx, cy, width, height = numbers(stated, "camera", where, (len(INTRINSICS),)).tolist()
+        row = {"camera": [values[key] for key in INTRINSICS]}
+        fx, fy, cx, cy, width, height = numbers(row, "camera", where, (len(INTRINSICS),)).tolist()
         # Cameras are held in float32, in which 1e-50 is zero and 1e300 infinite.
         if not (1e-9 <= fx <= 1e9 and 1e-9 <= fy <= 1e9 and abs(cx) <= 1e9 and abs(cy) <= 1e9):
             raise InputError(

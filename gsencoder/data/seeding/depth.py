@@ -9,17 +9,25 @@ The mean of all samples in a voxel lies between the surfaces where two of them s
 the table. Samples are therefore summed by voxel, by the axis direction that they face, and by their layer along the
 normal; sums of one voxel that turn out to be the same surface are joined again at the end. Sums add up in any order,
 so frames stream through in constant memory.
+
+The grid turns and moves with the room: its axes are those with the largest Σ (n · axis)⁴ over the normals n of depth
+images, the walls' and the floor's in most rooms (a Manhattan world, Coughlan and Yuille 1999).
 """
 
+import warnings
+from dataclasses import replace
+from itertools import permutations
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from gsencoder.core.errors import InputError, error_prefix
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix
 from gsencoder.core.threads import ahead, kernel
-from gsencoder.types import Views
-from gsencoder.types.scene import pixel_centers, unproject_points
+from gsencoder.data.seeding.points import flat_gaussians
+from gsencoder.types import Gaussians, Views
+from gsencoder.types.scene import invert_rigid, pixel_centers, transform, unproject_points
 
 AXIS_BITS = 19  # Bits of a voxel index along one axis: 524,288 voxels, or 10 km at 2 cm
 OUT_OF_REACH = 2.0**62  # Voxels that no integer counts
@@ -381,3 +389,105 @@ def _gradient(inverse, valid, step):
             behind = max(after, -before) > edge + 3 * smaller or (after > edge and -before > edge)
             astray[y, x] = between or behind
     return gradient, astray
+
+
+AXES_STEPS = 40
+
+
+def fit_axes(normals: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Orthonormal rows with a large Σ (n · axis)⁴, from a first guess. The sum is convex in the axes, so that the
+    orthonormal matrix nearest to its gradient never has a smaller one."""
+    for _ in range(AXES_STEPS):
+        cosines = normals @ axes.T
+        left, _, right = np.linalg.svd((cosines * cosines * cosines).T @ normals)
+        axes = left @ right
+    return axes
+
+
+FRAME_VIEWS = 12  # Depth images that are looked at, evenly spaced
+FRAME_SIDE = 240
+"""Longer side in pixels of these depth images; of larger ones every second, third … row and column is taken."""
+FRAME_NORMALS = 2000  # Normals of each that are used
+FRAME_STARTS = 4  # Cameras whose axes the search begins at
+
+
+def room_frame(views: Views) -> Float64[np.ndarray, "4 4"] | None:
+    """frame_from_world, rigid: the axes lie along walls, floor and furniture, the origin is the mean of the cameras.
+
+    None where no surface is seen, and without depth.
+
+    A grid of cubes is the same whichever axis comes first and whichever way it points. Each is the one nearest to the
+    world's, so that rows that are sorted by cells come in the world's order.
+    """
+    normals = _normals(views) if views.depths is not None and len(views) else np.empty((0, 3))
+    if not len(normals):
+        return None
+    poses, center = views.cameras.cam_from_world.astype(np.float64), views.cameras.centers.mean(axis=0)
+    fits = [fit_axes(normals, poses[view, :3, :3]) for view in even_indices(len(views), FRAME_STARTS)]
+    axes = max(fits, key=lambda each: float(np.square(np.square(normals @ each.T)).sum()))
+    frame = np.eye(4)
+    frame[:3, :3] = _nearest_order(axes)
+    frame[:3, 3] = -frame[:3, :3] @ center
+    return frame
+
+
+def _normals(views: Views) -> Float64[np.ndarray, "n 3"]:
+    """Unit normals in the world of the surfaces that some depth images show."""
+    assert views.depths is not None
+    parts = [np.empty((0, 3))]
+    for view in even_indices(len(views), FRAME_VIEWS):
+        depth = views.depths[int(view)]
+        step = -(-max(depth.shape) // FRAME_SIDE)
+        K = views.cameras.Ks[view] / np.array([[step], [step], [1]], np.float32)
+        # Depth that cannot be is refused where all of it is read.
+        with np.errstate(all="ignore"):
+            pixels = surface_pixels(np.ascontiguousarray(depth[::step, ::step]), K)
+        local = pixels.normals[pixels.use].astype(np.float64)
+        local = local[np.isfinite(local).all(axis=1)]
+        local = local[even_indices(len(local), FRAME_NORMALS)] if len(local) else local
+        parts.append(local @ views.cameras.cam_from_world[view, :3, :3])
+    return np.concatenate(parts)
+
+
+def _nearest_order(axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The same three lines as rows of a rotation, each as near to its axis of the world as can be."""
+    order = max(permutations(range(3)), key=lambda rows: float(np.abs(axes[list(rows)].diagonal()).sum()))
+    rotation = axes[list(order)]
+    rotation *= np.where(rotation.diagonal() < 0, -1, 1)[:, None]
+    rotation[np.abs(rotation.diagonal()).argmin()] *= np.sign(np.linalg.det(rotation))
+    return rotation
+
+
+LARGEST_SPACING = 4.0
+"""Upper limit of a Gaussian's spacing in voxels, for surfaces that the frames sample more coarsely than the grid."""
+
+
+def seed_from_depth(views: Views, *, voxel: float) -> Gaussians:
+    """Flat Gaussians on the surfaces that RGB-D frames show, one for each surface in each voxel.
+
+    Frames are read one at a time. Depth is smoothed within its own noise; pixels that float between two surfaces are
+    dropped; samples are averaged by voxel (its edge in world units), facing and layer, so that thin objects keep their
+    edges. The grid stands in a frame that turns and moves with the scene. The order of the views changes no more than
+    rounding, unless there are more than those a frame is taken from.
+    """
+    frame = room_frame(views)
+    world_from_frame = np.eye(4) if frame is None else invert_rigid(frame)
+    if frame is not None:
+        poses = views.cameras.cam_from_world.astype(np.float64) @ world_from_frame
+        views = replace(views, cameras=replace(views.cameras, cam_from_world=poses.astype(np.float32)))
+    samples, empty = depth_samples(views, voxel=voxel)
+    if not len(samples.points):
+        raise InputError(
+            f"seeds: none of the {len(views)} depth images shows a surface; check the files and their scale"
+        )
+    if empty:
+        warnings.warn(
+            f"seeds: {len(empty)} of {len(views)} views have no usable depth (first: {empty[0]!r})",
+            SceneWarning,
+            stacklevel=2,
+        )
+    points, normals = samples.points, samples.normals
+    if frame is not None:
+        points = transform(world_from_frame, points).astype(np.float32)
+        normals = (normals @ world_from_frame[:3, :3].T).astype(np.float32)
+    return flat_gaussians(points, normals, samples.colors, largest=LARGEST_SPACING * voxel)

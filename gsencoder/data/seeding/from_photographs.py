@@ -103,11 +103,12 @@ def splat_depths(
     camera = transform(pose, cloud)
     grid, inside = to_grid(camera, photo)
     camera, grid = camera[inside], grid[inside]
-    column, row = ((grid + 1) / 2 * torch.tensor([photo.width, photo.height])).long().unbind(-1)
-    index = row.clamp(max=photo.height - 1) * photo.width + column.clamp(max=photo.width - 1)
-    nearest = torch.full((photo.height * photo.width,), torch.inf)
+    height, width = photo.image.shape[:2]
+    column, row = ((grid + 1) / 2 * torch.tensor([width, height])).long().unbind(-1)
+    index = row.clamp(max=height - 1) * width + column.clamp(max=width - 1)
+    nearest = torch.full((height * width,), torch.inf)
     nearest.scatter_reduce_(0, index, camera[:, 2], "amin")
-    return torch.where(nearest.isfinite(), nearest, 0).reshape(photo.height, photo.width)
+    return torch.where(nearest.isfinite(), nearest, 0).reshape(height, width)
 
 
 def interpolate(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -137,7 +138,7 @@ def outside_hull(
     """Which points lie where photographs show that nothing is."""
     cameras, seen_empty = photographs.cameras, np.zeros(len(points), np.int64)
     for view in training:
-        empty = photographs.empty(view)
+        empty = photographs.empty[view]
         if empty is None:
             continue
         pixels, depths = cameras.project(points.astype(np.float64), view)
@@ -185,7 +186,7 @@ def covered_share(photographs: Photographs, views: Sequence[int], points: Float3
     cameras, shares = photographs.cameras, []
     for view in views:
         width, height = int(cameras.widths[view]), int(cameras.heights[view])
-        cell, mask = max(1.0, CELL * max(width, height)), photographs.mask(view)
+        cell, mask = max(1.0, CELL * max(width, height)), photographs.masks[view]
         across, down = math.ceil(width / cell), math.ceil(height / cell)
         in_mask, covered = np.ones((down, across), bool), np.zeros((down, across), bool)
         if mask is not None:

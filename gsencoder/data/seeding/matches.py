@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Track, untracked
-from gsencoder.data.readers.undistort import load_pycolmap
+from gsencoder.data.readers.posed import load_pycolmap
 from gsencoder.types import Cameras, Views
-from gsencoder.types.checks import invert_rigid
+from gsencoder.types.scene import invert_rigid
 
 DATABASE = "database.db"
 
@@ -74,8 +74,7 @@ class PairMatches:
 def _matched(
     views: Views, cameras: Cameras, pairs: Sequence[tuple[int, int]], features: int, track: Track
 ) -> Iterator[tuple[Any, Path]]:
-    """pycolmap, and a folder with images/, pictures at the size of `cameras`, and the database of their features and of
-    the nearest ones of pairs of views, whose geometry is not checked."""
+    """pycolmap, and a folder with pictures at the size of `cameras` and the database of their unchecked matches."""
     from PIL import Image
 
     pycolmap = load_pycolmap()

@@ -15,6 +15,7 @@ from gsencoder.types import Gaussians, Views
 LATTICE = 0.5  # Spacing of the samples on a triangle, in voxels
 LARGEST_SPACING = 2.0  # Upper limit of a Gaussian's spacing in voxels: samples of a mesh leave no wider gap
 TRIANGLES = 20_000
+TRUNCATION = 4.0  # How far the signed distance of fused frames reaches, in voxels of its grid
 MAX_SAMPLES = 200_000_000  # A mesh that needs more samples than this for its area is in other units than the voxel
 
 
@@ -65,7 +66,7 @@ def mesh_bounds(path: str | Path) -> tuple[Float64[np.ndarray, "3"], Float64[np.
     return together.min(axis=0), together.max(axis=0)
 
 
-def seed_from_tsdf(views: Views, *, voxel: float, truncation: float = 4.0, min_weight: float = 1.0) -> Gaussians:
+def seed_from_tsdf(views: Views, *, voxel: float) -> Gaussians:
     """Flat Gaussians on the vertices of the mesh that RGB-D frames fuse to: the setting of SplatDistill, section 3.1.
 
     Slower than seeds from the frames themselves, and thin objects melt into what they lie on, but the noise of many
@@ -73,8 +74,6 @@ def seed_from_tsdf(views: Views, *, voxel: float, truncation: float = 4.0, min_w
 
     Args:
         voxel: edge of the grid in world units; the signed distances are kept on one of half the size.
-        truncation: how far the signed distance reaches, in voxels of that finer grid.
-        min_weight: how many frames must agree on a voxel.
     """
     if not len(views) or views.depths is None or views.images is None:
         raise InputError("seeds: source=tsdf needs posed views with depth and images; use source=points or source=mesh")
@@ -112,11 +111,11 @@ def seed_from_tsdf(views: Views, *, voxel: float, truncation: float = 4.0, min_w
         K = views.cameras.Ks[view].astype(np.float64)
         K[:2, 2] -= 0.5
         intrinsic, pose = core.Tensor(K), core.Tensor(views.cameras.cam_from_world[view].astype(np.float64))
-        touched = blocks.compute_unique_block_coordinates(z, intrinsic, pose, 1.0, far, truncation)
-        blocks.integrate(touched, z, rgb, intrinsic, intrinsic, pose, 1.0, far, truncation)
+        touched = blocks.compute_unique_block_coordinates(z, intrinsic, pose, 1.0, far, TRUNCATION)
+        blocks.integrate(touched, z, rgb, intrinsic, intrinsic, pose, 1.0, far, TRUNCATION)
     if not count:
         raise InputError(f"seeds: none of the {len(views)} views has a depth above 0")
-    mesh = blocks.extract_triangle_mesh(min_weight)
+    mesh = blocks.extract_triangle_mesh(1.0)
     vertices = mesh.vertex.positions.numpy().astype(np.float32)
     if not len(vertices):
         raise InputError(f"seeds: the depth images fuse to no surface at {fine:g} units; take a larger voxel")

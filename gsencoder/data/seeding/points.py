@@ -264,16 +264,3 @@ def unit_of(scene: Scene, voxel: float) -> float:
         stacklevel=3,
     )
     return unit
-
-
-AXES_STEPS = 40
-
-
-def fit_axes(normals: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Orthonormal rows with a large Σ (n · axis)⁴, from a first guess. The sum is convex in the axes, so that the
-    orthonormal matrix nearest to its gradient never has a smaller one."""
-    for _ in range(AXES_STEPS):
-        cosines = normals @ axes.T
-        left, _, right = np.linalg.svd((cosines * cosines * cosines).T @ normals)
-        axes = left @ right
-    return axes

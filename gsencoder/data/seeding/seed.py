@@ -2,89 +2,27 @@
 
 One flat Gaussian stands on each piece of surface in each voxel, as wide as its neighbors are apart, in the color
 that the photographs show. Such a splat renders well enough for features to be lifted onto it at once.
-
-The grid turns and moves with the room: its axes are those with the largest Σ (n · axis)⁴ over the normals n of depth
-images, the walls' and the floor's in most rooms (a Manhattan world, Coughlan and Yuille 1999).
 """
 
 import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import permutations
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import file_of_scene
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import check_limits, option
-from gsencoder.data.seeding.depth import depth_samples, read_rgbd, surface_pixels
+from gsencoder.data.seeding.depth import read_rgbd, seed_from_depth
 from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
-from gsencoder.data.seeding.points import fit_axes, flat_gaussians, seed_from_points, typical_spacing
+from gsencoder.data.seeding.points import seed_from_points, typical_spacing
 from gsencoder.types import Gaussians, Scene, Views
-from gsencoder.types.checks import invert_rigid, transform
 
-MAX_VIEWS = 12  # Depth images that are looked at, evenly spaced
-MAX_SIDE = 240
-"""Longer side in pixels of these depth images; of larger ones every second, third … row and column is taken."""
-SAMPLES = 2000  # Normals of each that are used
-STARTS = 4  # Cameras whose axes the search begins at
-
-
-def room_frame(views: Views) -> Float64[np.ndarray, "4 4"] | None:
-    """frame_from_world, rigid: the axes lie along walls, floor and furniture, the origin is the mean of the cameras.
-
-    None where no surface is seen, and without depth.
-
-    A grid of cubes is the same whichever axis comes first and whichever way it points. Each is the one nearest to the
-    world's, so that rows that are sorted by cells come in the world's order.
-    """
-    normals = _normals(views) if views.depths is not None and len(views) else np.empty((0, 3))
-    if not len(normals):
-        return None
-    poses = views.cameras.cam_from_world.astype(np.float64)
-    fits = [fit_axes(normals, poses[view, :3, :3]) for view in even_indices(len(views), STARTS)]
-    axes = max(fits, key=lambda each: float(np.square(np.square(normals @ each.T)).sum()))
-    frame = np.eye(4)
-    frame[:3, :3] = _nearest_order(axes)
-    frame[:3, 3] = -frame[:3, :3] @ views.cameras.centers.mean(axis=0, dtype=np.float64)
-    return frame
-
-
-def _normals(views: Views) -> Float64[np.ndarray, "n 3"]:
-    """Unit normals in the world of the surfaces that some depth images show."""
-    assert views.depths is not None
-    parts = [np.empty((0, 3))]
-    for view in even_indices(len(views), MAX_VIEWS):
-        depth = views.depths[int(view)]
-        step = -(-max(depth.shape) // MAX_SIDE)
-        K = views.cameras.Ks[view] / np.array([[step], [step], [1]], np.float32)
-        # Depth that cannot be is refused where all of it is read.
-        with np.errstate(all="ignore"):
-            pixels = surface_pixels(np.ascontiguousarray(depth[::step, ::step]), K)
-        local = pixels.normals[pixels.use].astype(np.float64)
-        local = local[np.isfinite(local).all(axis=1)]
-        local = local[even_indices(len(local), SAMPLES)] if len(local) else local
-        parts.append(local @ views.cameras.cam_from_world[view, :3, :3])
-    return np.concatenate(parts)
-
-
-def _nearest_order(axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The same three lines as rows of a rotation, each as near to its axis of the world as can be."""
-    order = max(permutations(range(3)), key=lambda rows: float(np.abs(axes[list(rows)].diagonal()).sum()))
-    rotation = axes[list(order)]
-    rotation *= np.where(rotation.diagonal() < 0, -1, 1)[:, None]
-    rotation[np.abs(rotation.diagonal()).argmin()] *= np.sign(np.linalg.det(rotation))
-    return rotation
-
-
-LARGEST_SPACING = 4.0
-"""Upper limit of a Gaussian's spacing in voxels, for surfaces that the frames sample more coarsely than the grid."""
 TYPICAL_DEPTH_IN_VOXELS = 100
 """Depth images without a unit: their median depth is taken to be this many voxels, as 2 m are of 2 cm."""
 EXTENT_IN_VOXELS = 300
@@ -162,37 +100,6 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untr
         return seed_from_photographs(views, track=track)
     voxel = _voxel(scene, config, lambda: _depth_voxel(views), "one hundredth of the median depth")
     return seed_from_tsdf(views, voxel=voxel) if source == "tsdf" else seed_from_depth(views, voxel=voxel)
-
-
-def seed_from_depth(views: Views, *, voxel: float) -> Gaussians:
-    """Flat Gaussians on the surfaces that RGB-D frames show, one for each surface in each voxel.
-
-    Frames are read one at a time. Depth is smoothed within its own noise; pixels that float between two surfaces are
-    dropped; samples are averaged by voxel (its edge in world units), facing and layer, so that thin objects keep their
-    edges. The grid stands in a frame that turns and moves with the scene. The order of the views changes no more than
-    rounding, unless there are more than those a frame is taken from.
-    """
-    frame = room_frame(views)
-    world_from_frame = np.eye(4) if frame is None else invert_rigid(frame)
-    if frame is not None:
-        poses = views.cameras.cam_from_world.astype(np.float64) @ world_from_frame
-        views = replace(views, cameras=replace(views.cameras, cam_from_world=poses.astype(np.float32)))
-    samples, empty = depth_samples(views, voxel=voxel)
-    if not len(samples.points):
-        raise InputError(
-            f"seeds: none of the {len(views)} depth images shows a surface; check the files and their scale"
-        )
-    if empty:
-        warnings.warn(
-            f"seeds: {len(empty)} of {len(views)} views have no usable depth (first: {empty[0]!r})",
-            SceneWarning,
-            stacklevel=2,
-        )
-    points, normals = samples.points, samples.normals
-    if frame is not None:
-        points = transform(world_from_frame, points).astype(np.float32)
-        normals = (normals @ world_from_frame[:3, :3].T).astype(np.float32)
-    return flat_gaussians(points, normals, samples.colors, largest=LARGEST_SPACING * voxel)
 
 
 def _voxel(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:

@@ -73,11 +73,6 @@ def depth_range(cameras: Cameras, view: int, points: Float32[np.ndarray, "P 3"])
     return 0.85 * float(near), 1.3 * float(far)
 
 
-def _points_at(depth: Float[Tensor, "h w"], photo: ScaledPhotograph) -> Float[Tensor, "h w 3"]:
-    """Points on the rays through the pixel centers at depths z, in camera axes."""
-    return unproject_points(torch.from_numpy(pixel_centers(photo.width, photo.height)).float(), depth, photo.K)
-
-
 def _planes(
     rays: Tensor,
     relative: Sequence[Tensor],
@@ -111,7 +106,9 @@ def sweep(
     max_planes: int = MAX_PLANES,
 ) -> DepthMap:
     """Depths of a view by comparing it with others, at least two, so that occluded pixels are recognized."""
-    rays = _points_at(torch.ones(reference.height, reference.width), reference)
+    height, width = reference.image.shape[:2]
+    pixels = torch.from_numpy(pixel_centers(width, height)).float()
+    rays = unproject_points(pixels, torch.ones(height, width), reference.K)
     relative = [other @ invert_rigid(pose) for other in source_poses]
     depths = _planes(rays, relative, sources, near, far, max_planes)
     windows = _Windows(reference.image.mean(dim=-1)[None, None])
@@ -187,7 +184,8 @@ def _correlations(
 def to_grid(points: Float[Tensor, "*n 3"], photo: ScaledPhotograph) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
     """Where points in a camera lie in its picture, as grid_sample counts (−1 to 1), and whether they are in it."""
     # The intrinsics of an image whose pixels run from −1 to 1.
-    scale = photo.K.new_tensor([2 / photo.width, 2 / photo.height, 1.0])
+    height, width = photo.image.shape[:2]
+    scale = photo.K.new_tensor([2 / width, 2 / height, 1.0])
     K = scale[:, None] * photo.K
     K[:2, 2] -= 1
     grid = project_points(points, K, min_depth=SMALLEST_DEPTH)
@@ -237,7 +235,8 @@ def world_points(
     depth: Float[Tensor, "h w"], photo: ScaledPhotograph, pose: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "h w 3"]:
     """The world points that the pixels of a view show."""
-    return transform(invert_rigid(pose), _points_at(depth, photo))
+    pixels = torch.from_numpy(pixel_centers(*reversed(depth.shape))).float()
+    return transform(invert_rigid(pose), unproject_points(pixels, depth, photo.K))
 
 
 def back_project(

@@ -23,23 +23,21 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import atomic_file, open_foreign, warn_if_modified
 from gsencoder.data.splats.packed import GZIP_MAGIC, MAGIC, read_sog_folder, read_sog_zip, read_spz, write_spz
 from gsencoder.data.splats.ply import (
+    RawSplat,
     is_compressed,
+    logits_from_opacities,
+    logs_from_scales,
     morton_order,
+    odd_values,
+    opacities_from_logits,
     packed_bytes,
     read_columns,
     read_compressed,
     read_dotsplat,
     read_header,
     read_inria,
-    write_inria,
-)
-from gsencoder.data.splats.raw import (
-    RawSplat,
-    logits_from_opacities,
-    logs_from_scales,
-    odd_values,
-    opacities_from_logits,
     unusable_rows,
+    write_inria,
 )
 from gsencoder.types import Gaussians
 

@@ -25,7 +25,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import read_foreign
-from gsencoder.data.splats.raw import (
+from gsencoder.data.splats.ply import (
     SH_COEFFICIENTS,
     RawSplat,
     check_expansion,

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats.raw import (
+from gsencoder.data.splats.ply import (
     LOGIT_LIMIT,
     RawSplat,
     linear_columns,

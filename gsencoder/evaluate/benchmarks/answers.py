@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 from gsencoder.core.errors import InputError, SceneWarning, counted
 from gsencoder.data.labels.files import (
+    brief,
     entries_of,
     id_value,
     number,
@@ -32,7 +33,6 @@ from gsencoder.data.labels.files import (
     read_benchmark_json,
     refuse_repeated,
     scene_name,
-    shown,
     text_list,
     text_value,
 )
@@ -320,7 +320,7 @@ def _questions_of(
     ]
     if len({(each.position, each.rotation) for each in fitting}) != 1:
         fault = f"{len(fitting)} questions; give its question_id" if fitting else "no question of the truth"
-        raise InputError(f"{where}: scene, situation, question and place are those of {fault}: {shown(text)}")
+        raise InputError(f"{where}: scene, situation, question and place are those of {fault}: {brief(text)}")
     return fitting
 
 

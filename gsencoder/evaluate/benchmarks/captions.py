@@ -28,12 +28,12 @@ from gsencoder.data.labels.expressions import Expression, read_scanrefer, wrappe
 from gsencoder.data.labels.files import (
     Corner,
     box_ious,
+    brief,
     corner_bounds,
     entries_of,
     object_id,
     read_benchmark_json,
     scene_name,
-    shown,
     text_list,
     text_value,
 )
@@ -202,13 +202,13 @@ def read_caption_predictions(path: Path, objects: Sequence[CaptionedObject]) -> 
     if not isinstance(content, dict):
         swapped = isinstance(content, list) and content and isinstance(content[0], dict) and "ann_id" in content[0]
         hint = "; this is truth: were predictions and truth swapped?" if swapped else ""
-        raise InputError(f"{path}: expected {EXPECTED}, got {shown(content)}{hint}")
+        raise InputError(f"{path}: expected {EXPECTED}, got {brief(content)}{hint}")
     if any("|" in key for key in content):
         return {}, _named(content, path, objects)
     scenes = {each.scene for each in objects}
     boxes: BoxCaptions = {}
     for key, rows in content.items():
-        where = f"{path}: {shown(key)}"
+        where = f"{path}: {brief(key)}"
         if scene_name(key, where) not in scenes:
             raise InputError(f"{where}: is no scene of the truth")
         for entry, place in entries_of(rows, path, "caption and box", key=key):
@@ -222,16 +222,16 @@ def _named(content: Mapping[str, Any], path: Path, objects: Sequence[CaptionedOb
     key_of: dict[tuple[str, int], str] = {}
     captions: NamedCaptions = {}
     for key, value in content.items():
-        where = f"{path}: {shown(key)}"
+        where = f"{path}: {brief(key)}"
         scene, _, rest = key.partition("|")
         number_text, _, name = rest.partition("|")
         identity = scene_name(scene, where), object_id(number_text, where)
         if identity not in names:
             raise InputError(f"{where}: is no object of the truth")
         if name and name != names[identity]:
-            raise InputError(f"{where}: the truth calls this object {shown(names[identity])}")
+            raise InputError(f"{where}: the truth calls this object {brief(names[identity])}")
         if identity in key_of:
-            raise InputError(f"{where}: is the same object as {shown(key_of[identity])}")
+            raise InputError(f"{where}: is the same object as {brief(key_of[identity])}")
         sentences = text_list(value, where, "caption", empty=True)
         if len(sentences) != 1:
             raise InputError(f"{where}: has {len(sentences)} captions, expected one")

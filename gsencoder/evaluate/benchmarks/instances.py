@@ -55,9 +55,9 @@ from gsencoder.data.labels.classes import (
 )
 from gsencoder.data.labels.files import (
     read_checked_text,
+    read_integer_lines,
     read_mask,
-    read_whole_numbers,
-    write_whole_numbers,
+    write_integer_lines,
 )
 from gsencoder.data.labels.scans import labels_of_scan
 from gsencoder.evaluate.benchmarks.files import ScoreOptions, scene_files
@@ -116,7 +116,7 @@ class InstancesBenchmark(Benchmark[None]):
             ids = instance_ids(points.objects, points.names, classes.id_of)
         for name in (LABELS, PREDICTIONS):
             self.evaluation.file(name).mkdir(exist_ok=True)
-        write_whole_numbers(self.evaluation.file(LABELS) / f"{scene.name}.txt", ids)
+        write_integer_lines(self.evaluation.file(LABELS) / f"{scene.name}.txt", ids)
         write_instance_prediction(self.evaluation.file(PREDICTIONS), masks)
 
     def report(self, results: Sequence[SceneResult[None]]) -> ScoreReport:  # noqa: ARG002 - files hold all
@@ -524,7 +524,7 @@ def match_instance_files(
 
 def read_instance_ids(path: Path) -> Int64[np.ndarray, " V"]:
     """Reads the instance of each vertex of a scene: class id · 1000 + number."""
-    ids = read_whole_numbers(path, hint="; predictions and truth may be swapped")
+    ids = read_integer_lines(path, hint="; predictions and truth may be swapped")
     if not len(ids):
         raise InputError(f"{path}: no vertices; expected one whole number for each")
     return ids

@@ -27,13 +27,13 @@ from gsencoder.core.errors import InputError, counted, error_prefix
 from gsencoder.core.files import write_json
 from gsencoder.data.labels.classes import load_classes, write_classes
 from gsencoder.data.labels.files import (
+    brief,
     entries_of,
     name_value,
     object_id,
     read_benchmark_json,
     refuse_repeated,
     scene_name,
-    shown,
 )
 from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.protocol import (
@@ -236,7 +236,7 @@ def read_recognition_predictions(path: Path) -> dict[ObjectKey, tuple[str, ...]]
         if values is None and "labels" in entry:
             values = []
         if not isinstance(values, list):
-            raise InputError(f"{where}: labels must be a list of names, got {shown(values)}")
+            raise InputError(f"{where}: labels must be a list of names, got {brief(values)}")
         names = (name_value(value, where, f"labels[{index}]") for index, value in enumerate(values))
         predictions[key] = tuple(names)
     return predictions

@@ -51,6 +51,7 @@ from gsencoder.data.labels.files import (
     annotation_id,
     box_corners,
     box_ious,
+    brief,
     corner_bounds,
     entries_of,
     flag_value,
@@ -58,7 +59,6 @@ from gsencoder.data.labels.files import (
     read_benchmark_json,
     refuse_repeated,
     scene_name,
-    shown,
 )
 from gsencoder.data.labels.scans import find_labels, find_scannet_files
 from gsencoder.evaluate.benchmarks.files import ScoreOptions
@@ -527,7 +527,7 @@ def _boxes(row: Entry) -> Float64[np.ndarray, "K 2 3"]:
         boxes = single
     else:
         if not isinstance(several, list) or len(several) > MAX_BOXES:
-            actual = f"{len(several):,}" if isinstance(several, list) else shown(several)
+            actual = f"{len(several):,}" if isinstance(several, list) else brief(several)
             raise InputError(f"{where}: bboxes must be a list of at most {MAX_BOXES:,} boxes, got {actual}")
         boxes = [corner_bounds(box, where, f"bboxes[{index}]") for index, box in enumerate(several)]
         if single and single != boxes[:1]:

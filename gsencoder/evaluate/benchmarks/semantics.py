@@ -39,7 +39,7 @@ from gsencoder.data.labels.classes import (
     vertex_classes,
     write_classes,
 )
-from gsencoder.data.labels.files import read_whole_numbers, write_whole_numbers
+from gsencoder.data.labels.files import read_integer_lines, write_integer_lines
 from gsencoder.data.labels.mesh import VOTERS, labels_of_vertices
 from gsencoder.data.labels.scans import labels_of_scan
 from gsencoder.evaluate.benchmarks.files import ScoreOptions, scene_files
@@ -89,7 +89,7 @@ class SemanticsBenchmark(Benchmark[None]):
         predicted = predict_semantics(points, scene.gaussians, features, classes, self.evaluation.words)
         for name, values in ((LABELS, class_ids(points, classes)), (PREDICTIONS, predicted)):
             self.evaluation.file(name).mkdir(exist_ok=True)
-            write_whole_numbers(self.evaluation.file(name) / f"{scene.name}.txt", values)
+            write_integer_lines(self.evaluation.file(name) / f"{scene.name}.txt", values)
 
     def report(self, results: Sequence[SceneResult[None]]) -> ScoreReport:  # noqa: ARG002 - files hold all
         write_classes(self.evaluation.file(CLASS_IDS), self.classes.table)
@@ -302,7 +302,7 @@ def class_ids_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTa
 
 
 def _class_ids(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
-    labels = read_whole_numbers(path)
+    labels = read_integer_lines(path)
     if not len(labels):
         raise InputError(f"{path}: no vertices; expected one class id for each")
     large = labels[(labels >= IDS_PER_CLASS) & ((labels < RAW_IDS.start) | (labels >= RAW_IDS.stop))]

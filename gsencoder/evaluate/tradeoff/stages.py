@@ -49,11 +49,10 @@ from gsencoder.infer.views.choose import choose_views, score_views
 from gsencoder.infer.views.pictures import view_pictures
 from gsencoder.infer.views.targets import ViewsConfig, ViewSet, target_of, targets_of
 from gsencoder.memory.index import IndexConfig, index_features
-from gsencoder.reconstruct.parameters import apply_colors
 from gsencoder.reconstruct.plan import ReconstructBudget
 from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
 from gsencoder.render import BlendConfig
-from gsencoder.render.images import psnr, ssim, view_colors
+from gsencoder.render.images import apply_colors, psnr, ssim, view_colors
 from gsencoder.render.rasterize import rasterize
 from gsencoder.teachers.build import TeacherConfig, text_table_of
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher

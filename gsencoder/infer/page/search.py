@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int16, Int64, UInt8, UInt16
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.packed import write_spz
-from gsencoder.data.splats.raw import RawSplat, logits_from_opacities, logs_from_scales
+from gsencoder.data.splats.ply import RawSplat, logits_from_opacities, logs_from_scales
 from gsencoder.infer.draw import fit_pca_colors, pca_picture
 from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize, select_features, spacing_of
 from gsencoder.infer.relevancy import GaussianProducts, ThresholdConfig, threshold, word_directions

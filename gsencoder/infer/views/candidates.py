@@ -21,8 +21,7 @@ from gsencoder.infer.views.photographs import photograph_cameras
 from gsencoder.infer.views.targets import CONSTANTS, Target, ViewsConfig
 from gsencoder.render import blend
 from gsencoder.types import Cameras, Gaussians, Scene
-from gsencoder.types.checks import look_rotation
-from gsencoder.types.scene import concatenate_cameras
+from gsencoder.types.scene import concatenate_cameras, look_rotation
 
 
 def closeups(

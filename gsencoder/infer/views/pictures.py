@@ -21,7 +21,7 @@ from gsencoder.infer.views.targets import SelectedView, Target, ViewSet
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import render_image
 from gsencoder.types import Box, Cameras, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Scene
-from gsencoder.types.checks import move_origin
+from gsencoder.types.scene import move_origin
 
 SOLID_WEIGHT = 0.5
 """A pixel shows a target from so much weight on."""

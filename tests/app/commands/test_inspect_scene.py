@@ -13,7 +13,7 @@ from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import main as cli
 from gsencoder.types import Cameras
-from gsencoder.types.checks import OPENCV_FROM_OPENGL
+from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 VIEWS = 4
 Change = Callable[[dict[str, Any]], None]

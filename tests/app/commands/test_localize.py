@@ -23,7 +23,7 @@ from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.text.table import WORDS_FILE, load_text_table, make_text_table, save_text_table
 from gsencoder.text.vocabulary import closed_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory, Scene
-from gsencoder.types.checks import OPENCV_FROM_OPENGL
+from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 CUBE = ORIGIN + np.array([0.3, 0.2, 0.8])
 

@@ -11,7 +11,7 @@ from labeled_scans import ROOM_NAMES, group, names_of_room, write_scannet_labels
 
 from gsencoder.app import main as cli
 from gsencoder.data.labels.classes import ids_of_names, instance_ids, read_label_map, vertex_classes
-from gsencoder.data.labels.files import read_whole_numbers, write_whole_numbers
+from gsencoder.data.labels.files import read_integer_lines, write_integer_lines
 from gsencoder.data.labels.scans import read_scannet_labels
 from gsencoder.data.synthetic import make_room
 from gsencoder.evaluate.benchmarks.instances import prediction_of_masks
@@ -62,14 +62,14 @@ def write_truth_files(scans: Path, column: str, ids_of: object) -> Path:
         labels = read_scannet_labels(scan)
         ids = ids_of_names((name for _, name in labels.objects), read_label_map(scans.parent / "map.tsv", column))
         values = ids_of(labels.instances, dict(labels.objects), ids)  # type: ignore[operator]
-        write_whole_numbers(folder / f"{scan.name}.txt", values)
+        write_integer_lines(folder / f"{scan.name}.txt", values)
     return folder
 
 
 def test_instances_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(scans: Path, tmp_path: Path) -> None:
     write_masks(scans)
     truth = write_truth_files(scans, "nyu40id", instance_ids)
-    assert read_whole_numbers(truth / "scene0000_00.txt")[[0, 150, 270, 380]].tolist() == [5001, 6002, 1003, 40004]
+    assert read_integer_lines(truth / "scene0000_00.txt")[[0, 150, 270, 380]].tolist() == [5001, 6002, 1003, 40004]
     outs = tmp_path / "scans_out", tmp_path / "files_out"
     assert cli.main([*words_of("instances", scans), f"out={outs[0]}", "quiet=true"]) == 0
     words = ["score", "instances", f"predictions={tmp_path / 'predictions'}", f"truth={truth}", "classes=scannet20"]
@@ -85,7 +85,7 @@ def test_labels_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(sc
     predictions = tmp_path / "predictions"
     predictions.mkdir()
     for scene in ("scene0000_00", "scene0001_00"):
-        write_whole_numbers(predictions / f"{scene}.txt", np.repeat([5, 6, 5, 1], SIZES))
+        write_integer_lines(predictions / f"{scene}.txt", np.repeat([5, 6, 5, 1], SIZES))
     truth = write_truth_files(scans, "nyu40id", vertex_classes)
     outs = tmp_path / "scans_out", tmp_path / "files_out"
     assert cli.main([*words_of("semantics", scans), f"out={outs[0]}", "quiet=true"]) == 0

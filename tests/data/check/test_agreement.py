@@ -19,14 +19,15 @@ from gsencoder.data.check.agreement import (
     fit_registration,
     grey_picture,
     on_surface,
+    other_orders,
+    other_readings,
     residuals,
     shared_samples,
     world_samples,
 )
-from gsencoder.data.check.findings import other_orders, other_readings
-from gsencoder.data.check.scene_check import _needed, check_depth, fit_pose, surface_normals, view_spreads
+from gsencoder.data.check.scene_check import check_depth, fit_pose, surface_normals, view_spreads
 from gsencoder.types import Views
-from gsencoder.types.checks import invert_rigid, transform
+from gsencoder.types.scene import invert_rigid, transform
 
 COUNT = 6
 
@@ -235,5 +236,5 @@ def test_a_check_looks_at_as_many_views_as_it_says(views):
     check = check_depth(views, limit=3)
     assert check.views.tolist() == [0, 2, 5]
     assert len(check.depth) == 3
-    assert _needed(check.depth) == pytest.approx(0.02 * 3 * 2 * SAMPLES)
-    assert check.comparable == (check.best.compared >= _needed(check.depth))
+    assert check.depth.min_compared == pytest.approx(0.02 * 3 * 2 * SAMPLES)
+    assert check.comparable == (check.best.compared >= check.depth.min_compared)

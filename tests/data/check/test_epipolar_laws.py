@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from textured_box import box_cameras
 
+from gsencoder.data.check.agreement import other_poses
 from gsencoder.data.check.epipolar import (
     CLIP,
     MIN_MATCHES,
@@ -20,7 +21,6 @@ from gsencoder.data.check.epipolar import (
     mean_error,
     near_pairs,
 )
-from gsencoder.data.check.findings import other_poses
 from gsencoder.data.seeding.matches import PairMatches, epipolar_distances, fundamental_matrix
 from gsencoder.types import Cameras
 

@@ -10,12 +10,10 @@ import pytest
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.check.agreement import RegistrationFit
-from gsencoder.data.check.findings import Finding, repair_posed
-from gsencoder.data.readers.posed import PosedImage, PosedImages
+from gsencoder.data.check.agreement import Finding, RegistrationFit, repair_posed
+from gsencoder.data.readers.posed import CameraModel, PosedImage, PosedImages
 from gsencoder.data.readers.transforms_json import DISTORTION, read_transforms, transforms_of
-from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.types.scene import OPENCV_FROM_OPENGL, invert_rigid
 
 PINHOLE = CameraModel(model="PINHOLE", width=64, height=48, params=(50.0, 51.0, 32.0, 24.0))
 

@@ -23,7 +23,7 @@ from gsencoder.data.check.scene_check import (
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.seeding.matches import match_photographs
 from gsencoder.types import Cameras, Scene, Views
-from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.types.scene import OPENCV_FROM_OPENGL, invert_rigid
 
 ROW = 3
 """The view that alone is wrong."""

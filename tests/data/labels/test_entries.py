@@ -10,6 +10,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.labels.files import (
     annotation_id,
     box_corners,
+    brief,
     corner_bounds,
     entries_of,
     flag_value,
@@ -19,7 +20,6 @@ from gsencoder.data.labels.files import (
     object_id,
     refuse_repeated,
     scene_name,
-    shown,
     text_list,
     text_value,
 )
@@ -45,7 +45,7 @@ def test_a_number_is_finite_and_at_most_so_large() -> None:
     for value in (float("nan"), float("inf"), 1.1e15, -1.1e15, 10**400):
         assert "x must be a finite number of at most 1e+15" in refused(number, value, HERE, "x")
     for value in (True, "3", None):
-        assert f"x must be a number, got {shown(value)}" in refused(number, value, HERE, "x")
+        assert f"x must be a number, got {brief(value)}" in refused(number, value, HERE, "x")
 
 
 def test_the_eight_corners_go_around_the_top_and_then_around_the_bottom() -> None:
@@ -130,5 +130,5 @@ def test_two_entries_of_one_key_are_named_with_their_numbers(tmp_path: Any) -> N
 def test_what_is_shown_of_a_value_is_short_and_on_one_line() -> None:
     values = ([1], {"a": 1}, None, "a\nb", 1.5)
     assert [*map(shown, values)] == ["a list", "an object", "nothing", "'a\\nb'", "1.5"]
-    assert shown("a" * 100) == repr("a" * 60)
-    assert len(shown(10**100)) == 80
+    assert brief("a" * 100) == repr("a" * 60)
+    assert len(brief(10**100)) == 80

@@ -11,11 +11,10 @@ from gsencoder.data.labels.files import (
     LIST_BYTES,
     SCENE_BYTES,
     check_file,
-    mask_bytes,
     read_checked_text,
+    read_integer_lines,
     read_mask,
-    read_whole_numbers,
-    write_whole_numbers,
+    write_integer_lines,
 )
 
 
@@ -26,10 +25,10 @@ def written(path: Path, content: bytes) -> Path:
 
 @pytest.mark.parametrize("number", [2**31 - 1, -(2**31 - 1)])
 def test_numbers_are_those_of_31_bits(tmp_path: Path, number: int) -> None:
-    assert read_whole_numbers(written(tmp_path / "n.txt", f"1\n{number}\n".encode())).tolist() == [1, number]
+    assert read_integer_lines(written(tmp_path / "n.txt", f"1\n{number}\n".encode())).tolist() == [1, number]
     beyond = number + (1 if number > 0 else -1)
     with pytest.raises(InputError, match=f"line 2: expected one whole number, got '{beyond}'; swapped"):
-        read_whole_numbers(written(tmp_path / "n.txt", f"1\n{beyond}\n".encode()), hint="; swapped")
+        read_integer_lines(written(tmp_path / "n.txt", f"1\n{beyond}\n".encode()), hint="; swapped")
 
 
 @pytest.mark.parametrize(
@@ -53,7 +52,7 @@ def test_what_is_not_0_is_in_a_mask(tmp_path: Path, content: bytes, expected: li
 )
 def test_other_lines_are_named_in_masks_and_in_numbers(tmp_path: Path, content: bytes) -> None:
     path = written(tmp_path / "m.txt", content)
-    for read in (read_mask, read_whole_numbers):
+    for read in (read_mask, read_integer_lines):
         with pytest.raises(InputError, match=r"m\.txt: line [12]: expected one whole number"):
             read(path)
 
@@ -62,10 +61,10 @@ def test_masks_and_numbers_of_several_chunks_are_read_back(tmp_path: Path, monke
     monkeypatch.setattr(number_files, "CHUNK", 3)
     for count in (0, 1, 3, 4, 7):
         values = np.arange(count) - 2
-        write_whole_numbers(tmp_path / "n.txt", values)
-        assert read_whole_numbers(tmp_path / "n.txt").tolist() == values.tolist()
-        assert read_mask(written(tmp_path / "m.txt", mask_bytes(values > 0))).tolist() == (values > 0).tolist()
-    assert mask_bytes(np.array([True, False])) == b"1\n0\n"
+        write_integer_lines(tmp_path / "n.txt", values)
+        assert read_integer_lines(tmp_path / "n.txt").tolist() == values.tolist()
+        lines = "".join(f"{int(value > 0)}\n" for value in values).encode()
+        assert read_mask(written(tmp_path / "m.txt", lines)).tolist() == (values > 0).tolist()
 
 
 def sparse(path: Path, size: int) -> Path:

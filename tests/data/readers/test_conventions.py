@@ -16,7 +16,7 @@ from gsencoder.data.readers.transforms_json import transforms_of
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.seeding.seed import choose_source, seed
 from gsencoder.data.splats.files import load_splat, read_raw
-from gsencoder.data.splats.raw import opacities_from_logits
+from gsencoder.data.splats.ply import opacities_from_logits
 from gsencoder.data.splats.repair import inspect_splat
 
 MASK = np.full((120, 160), 255, np.uint8)

@@ -9,7 +9,7 @@ from safetensors.numpy import save_file
 from scene_files import photograph, save, write_colmap, write_transforms
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.label_images import label_files, read_labels
+from gsencoder.data.readers.masks import label_files, read_labels
 from gsencoder.data.scenes import SceneConfig, load_scene
 
 LABELS = np.array([[0, 1, 2], [300, 0, 7]])

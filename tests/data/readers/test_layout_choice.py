@@ -6,8 +6,8 @@ import pytest
 from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.layouts import COLMAP_FOLDERS, colmap_model_in, layout_of, transforms_in
 from gsencoder.data.readers.posed import ReadOptions
+from gsencoder.data.scenes import COLMAP_FOLDERS, colmap_model_in, layout_of, transforms_in
 
 
 def model(folder: Path) -> None:

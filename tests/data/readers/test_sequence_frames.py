@@ -13,16 +13,17 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.posed import MAX_COORDINATE, ReadOptions, inside, rigid_pose
 from gsencoder.data.readers.rgbd import (
     KINECTS,
+    device_folder,
     interpolate_pose,
     is_seven_scenes,
     is_tum,
     read_replica,
+    read_scannetpp,
     read_seven_scenes,
     read_trajectory,
     read_tum,
 )
-from gsencoder.data.readers.scannetpp import device_folder, read_scannetpp
-from gsencoder.types.checks import invert_rigid
+from gsencoder.types.scene import invert_rigid
 
 
 def picture(path: Path, width: int, height: int, mode: str = "RGB") -> None:

@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 from seed_views import TILTED, K, camera, colors_of, frames, normals_of, plane_depth, rays, same, sphere_depth
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.seeding.depth import LAYER, SurfaceGrid, depth_samples, surface_pixels
+from gsencoder.data.seeding.depth import LAYER, SurfaceGrid, depth_samples, seed_from_depth, surface_pixels
 from gsencoder.data.seeding.points import quats_from_normals
-from gsencoder.data.seeding.seed import SeedConfig, seed, seed_from_depth
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
 

@@ -8,10 +8,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from textured_box import box_cameras, box_views
 
-from gsencoder.data.seeding.seed import SeedConfig, room_frame, seed
+from gsencoder.data.seeding.depth import room_frame
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
-from gsencoder.types.checks import invert_rigid
+from gsencoder.types.scene import invert_rigid
 
 
 def moved(views: Views, other_from_world: np.ndarray) -> Views:

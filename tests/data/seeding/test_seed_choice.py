@@ -8,7 +8,8 @@ from seed_views import camera, frames, plane_depth, same
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeding.seed import SeedConfig, seed, seed_from_depth
+from gsencoder.data.seeding.depth import seed_from_depth
+from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
 

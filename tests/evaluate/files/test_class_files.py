@@ -8,7 +8,7 @@ from labeled_scans import group, write_scannet_labels
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.classes import ClassTable, load_classes, write_classes
-from gsencoder.data.labels.files import write_whole_numbers
+from gsencoder.data.labels.files import write_integer_lines
 from gsencoder.evaluate.benchmarks.files import scene_files
 from gsencoder.evaluate.benchmarks.instances import instance_ids_of_scan
 from gsencoder.evaluate.benchmarks.semantics import class_ids_of_scan, count_label_files
@@ -109,7 +109,7 @@ def test_a_class_may_have_the_id_0_among_labels_and_not_among_instances(scan: Pa
 def label_folders(folder: Path, **labels: list[int]) -> tuple[Path, Path]:
     for name in ("predictions", "truth"):
         (folder / name).mkdir()
-        write_whole_numbers(folder / name / "s.txt", np.array(labels[name]))
+        write_integer_lines(folder / name / "s.txt", np.array(labels[name]))
     return folder / "predictions", folder / "truth"
 
 
@@ -134,9 +134,9 @@ def test_of_many_scenes_those_asked_for_are_taken_by_name_and_three_are_named_wh
     predictions, truth = label_folders(tmp_path, predictions=[1], truth=[1])
     for name in ("e", "b", "d", "a"):
         for folder in (predictions, truth):
-            write_whole_numbers(folder / f"{name}.txt", np.array([1]))
+            write_integer_lines(folder / f"{name}.txt", np.array([1]))
     assert [files.scene for files in scene_files(predictions, truth)] == ["a", "b", "d", "e", "s"]
     assert [files.scene for files in scene_files(predictions, truth, scenes=["s", "b", "s"])] == ["b", "s"]
-    write_whole_numbers(predictions / "x.txt", np.array([1]))
+    write_integer_lines(predictions / "x.txt", np.array([1]))
     with pytest.raises(InputError, match=r"x\.txt: there is no truth of this scene .*; it has a, b, d(?!.*\be\b)"):
         scene_files(predictions, truth)

@@ -9,7 +9,7 @@ from instance_scenes import write_text_prediction
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.data.labels.files import write_whole_numbers
+from gsencoder.data.labels.files import write_integer_lines
 from gsencoder.evaluate.benchmarks.files import scene_files
 from gsencoder.evaluate.benchmarks.instances import (
     InstancePrediction,
@@ -36,7 +36,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     for folder in (predictions, truth):
         folder.mkdir()
     write_text_prediction(predictions, prediction())
-    write_whole_numbers(truth / "scene0011_00.txt", IDS)
+    write_integer_lines(truth / "scene0011_00.txt", IDS)
     return predictions, truth
 
 
@@ -177,12 +177,12 @@ def test_folders_without_files_of_scenes_are_refused(folders: tuple[Path, Path],
 def label_folders(tmp_path: Path) -> tuple[Path, Path]:
     for name in ("predictions", "truth"):
         (tmp_path / name).mkdir()
-        write_whole_numbers(tmp_path / name / "scene0011_00.txt", np.array([4, 4, 5, 0]))
+        write_integer_lines(tmp_path / name / "scene0011_00.txt", np.array([4, 4, 5, 0]))
     return tmp_path / "predictions", tmp_path / "truth"
 
 
 def test_labels_of_folders_are_scored(label_folders: tuple[Path, Path]) -> None:
-    write_whole_numbers(label_folders[0] / "scene0011_00.txt", np.array([4, 5, 5, 4]))
+    write_integer_lines(label_folders[0] / "scene0011_00.txt", np.array([4, 5, 5, 4]))
     scores = semantic_scores(list(count_label_files(*label_folders, CLASSES)), CLASSES)
     assert scores.figures["miou"] == 1 / 2
     assert scores.ignored == 1
