@@ -81,12 +81,6 @@ class HeadSet:
     def names(self) -> tuple[str, ...]:
         return tuple(head.name for head in self.heads)
 
-    def figures(self) -> dict[str, dict[str, int | float]]:
-        return {head.name: head.figures() for head in self.heads}
-
-    def describe(self) -> list[str]:
-        return [head.describe() for head in self.heads]
-
 
 def measure_heads(
     heads: Sequence[Head], vectors: Float32[np.ndarray, "n D"], space: FeatureSpace, basis: FeatureBasis | None

@@ -298,8 +298,6 @@ class FeatureDecoder(nn.Module):
 
 def render_heads(heads: HeadSet, outputs: OutputSpace) -> list[tuple[AdapterHead, nn.Module]]:
     """Heads as the render loss takes them, each with a decoder from standard units to its input."""
-    if not heads.heads:
-        return []
     check_heads_space(heads.space, outputs.space)
     decode = FeatureDecoder(outputs)
     return [(AdapterHead(each.head.body, torch.from_numpy(each.mean), each.scale), decode) for each in heads.heads]

@@ -203,7 +203,7 @@ def fit(
     heads = dataset_heads(datasets[with_heads], config.heads)
     if len(heads.heads) < len(config.heads):
         raise InputError(f"heads: {', '.join(config.heads)} names a head twice; its loss would count twice")
-    digest_of_heads = heads_digest(heads)
+    digest_of_heads = heads_digest(heads) if config.heads else ""
     check_agreement("the heads of L_render", digest_of_heads)
     recipe = SampleRecipe(
         encoder=config.model,
@@ -233,7 +233,7 @@ def fit(
         config.train,
         folder=work,
         settings=resume_settings(config, datasets, training, digest_of_heads),
-        heads={with_heads: render_heads(heads, outputs[with_heads])},
+        heads={with_heads: render_heads(heads, outputs[with_heads])} if config.heads else {},
         process=process,
         device=device,
         tensorboard=config.tensorboard,

@@ -22,7 +22,7 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
 from gsencoder.data.up import with_up
-from gsencoder.fusion.basis import basis_figures, describe_basis
+from gsencoder.fusion.basis import basis_figures, describe_basis, project_maps
 from gsencoder.fusion.folder import FEATURES_FILE, save_features
 from gsencoder.infer.encode import EncodeConfig, Encoder, file_of_encoder, load_encoder
 from gsencoder.infer.encode_budget import (
@@ -220,7 +220,6 @@ def _basis_figures(
 def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Encoder, count: int) -> dict[str, float]:
     """How well the encoder's basis represents its teacher's maps of some of a scene's views."""
     # Teachers need torch, which encoding with an exported graph does without.
-    from gsencoder.fusion.basis import project_maps
     from gsencoder.fusion.checkpoint import upright
     from gsencoder.teachers.build import words_by_teacher
     from gsencoder.train.prepare_scenes import SourceConfig

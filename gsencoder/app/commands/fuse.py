@@ -218,5 +218,5 @@ def write_heads(folder: Path, heads: Sequence[Head], scene: Scene, fusion: Fusio
         sample = sample_cells(fusion.teacher, scene.views, fusion.views)
         measured = measure_heads(heads, sample.vectors(), fusion.features.space, fusion.features.basis)
         save_heads(folder / HEADS_FILE, measured)
-    run.results.update(heads=measured.figures())
-    return measured.describe()
+    run.results.update(heads={head.name: head.figures() for head in measured.heads})
+    return [head.describe() for head in measured.heads]

@@ -80,7 +80,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
             heads = dataset_heads(datasets[teacher_of_heads(config.teachers_by_name, heads_asked)], heads_asked)
         if config.prepare_only:
             run.print(f"{prepared}: {len(training)} scenes to train on, {len(held_out)} for validation")
-            run.print(*(f"{prepared}: {line}" for line in heads.describe()))
+            run.print(*(f"{prepared}: {head.describe()}" for head in heads.heads))
             return
         with fail_together():
             group.take(resume=config.resume)
@@ -109,7 +109,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
     for name, of_teacher in figures.items():
         of = f" for {name}" if len(figures) > 1 else ""
         run.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
-    run.print(*(f"{out}: {line}" for line in heads.describe()))
+    run.print(*(f"{out}: {head.describe()}" for head in heads.heads))
 
 
 def validator(config: TrainCommandConfig) -> SceneValidator:
@@ -139,6 +139,7 @@ def write_results(
     """Writes weights, words, heads, log and pictures; scores and the figures of each basis go into weights and
     summary."""
     steps, seconds = result.state.step, result.state.seconds
+    parameters = sum(value.numel() for value in result.encoder.parameters())
     provenance = {"settings": settings(config), "steps": steps, "seconds": seconds, "validation": result.scores}
     provenance["basis"] = figures if len(figures) > 1 else next(iter(figures.values()))
     save_weights(folder / WEIGHTS_FILE, result.encoder, result.outputs, provenance, dtype=config.store)
@@ -152,10 +153,10 @@ def write_results(
     run.results.update(
         steps=steps,
         seconds=seconds,
-        parameters=sum(value.numel() for value in result.encoder.parameters()),
+        parameters=parameters,
         validation=result.scores,
         basis=provenance["basis"],
-        heads=heads.figures(),
+        heads={head.name: head.figures() for head in heads.heads},
         weights=WEIGHTS_FILE,
         log=LOG_FILE,
     )
