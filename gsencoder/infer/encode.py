@@ -76,7 +76,9 @@ class Encoder:
         self.network, header = network, network.header
         self.voxel: float = header.voxel
         self.outputs: OutputSpaces = header.outputs
-        self.spaces: Mapping[str, FeatureSpace] = {name: header.outputs[name].space for name in header.outputs}
+        self.spaces: Mapping[str, FeatureSpace] = {
+            name: outputs.space for name, outputs in header.outputs.by_teacher.items()
+        }
         self.tables: Mapping[str, TextTable] = header.tables
         self.made_by: Mapping[str, Any] = header.made_by
 

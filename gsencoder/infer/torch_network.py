@@ -44,9 +44,9 @@ class TorchNetwork:
         """Reads a file, a folder of `train`, or weights that come with the package; see `find_weights`."""
         file = find_weights(weights)
         module, outputs, made_by = load_weights(file)
-        tables = load_tables(file.parent, outputs)
+        tables = load_tables(file.parent, outputs.by_teacher)
         for name, table in tables.items():
-            space = outputs[name].space
+            space = outputs.by_teacher[name].space
             if (table.space.text_encoder, table.space.channels) != (space.text_encoder, space.channels):
                 raise InputError(
                     f"{file.parent}: the words beside the encoder are of {table.space.text_encoder} "

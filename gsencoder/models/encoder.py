@@ -203,11 +203,11 @@ def load_weights(source: str | Path, option: str = "weights") -> tuple[GaussianE
     """Loads an encoder in evaluation mode, its output spaces, and settings and results of its training; see
     `find_weights` for the arguments."""
     with open_archive(find_weights(str(source), option)) as file:
-        config = _read_config(file.value("encoder", dict))
         outputs = read_output_spaces(file)
         dtype = file.value("dtype", str)
         if dtype not in ("float32", "float16"):
             raise InputError(f"expected parameters of float32 or float16, got {dtype[:20]!r}")
+        config = _read_config(file.value("encoder", dict))
         with torch.device("meta"):
             encoder = GaussianEncoder(config, outputs.widths)
         state = {

@@ -72,15 +72,15 @@ class OnnxTeacher(PictureTeacher):
         self.subject = self._network.subject
         self._classes = _load_classes(find_file(config.classes, "teacher.classes")) if config.classes else None
         shape = self._network.output_shape
-        stated = shape[-1 if config.layout == "tokens" else 1] if len(shape) == self._axes else None
+        channels = shape[-1 if config.layout == "tokens" else 1] if len(shape) == self._axes else None
         if self._classes is not None:
-            stated = self._classes.shape[1]
-        if not isinstance(stated, int) or stated < 1:
-            # What a model states of its output may be a name, or nothing at all; then it is run to see.
-            stated = self._run(np.zeros((2 * config.patch, 2 * config.patch, 3), np.uint8)).shape[-1]
+            channels = self._classes.shape[1]
+        if not isinstance(channels, int) or channels < 1:
+            # What a model says of its output may be a name, or nothing at all; then it is run to see.
+            channels = self._run(np.zeros((2 * config.patch, 2 * config.patch, 3), np.uint8)).shape[-1]
         self.space = FeatureSpace(
             name=config.space or self._network.name,
-            channels=int(stated),
+            channels=int(channels),
             teacher="onnx",
             weights=self._network.digest,
             layer=self._network.output + (f", top {TOP_CLASSES} classes as words" if config.classes else ""),

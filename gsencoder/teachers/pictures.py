@@ -169,7 +169,7 @@ class OnnxNetwork:
 
 
 FILES = ("processor_config.json", "preprocessor_config.json")
-"""Where it is stated: in the section `image_processor` of a processor's file, which transformers prefers, or alone."""
+"""Where it stands: in the section `image_processor` of a processor's file, which transformers prefers, or alone."""
 FLOAT_FILTERS = {Image.Resampling.BILINEAR: "bilinear", Image.Resampling.BICUBIC: "bicubic"}
 
 
@@ -219,14 +219,14 @@ class Preprocessing:
 def read_preprocessing(folder: Path, subject: str, *, floats: bool = False) -> Preprocessing:
     """The preprocessing that the folder of a model states.
 
-    Its sizes and crops are not used: a map is of the whole picture. Mean, standard deviation and filter must be stated,
+    Its sizes and crops are not used: a map is of the whole picture. Mean, standard deviation and filter must be given,
     since features of pictures that were normalized otherwise look plausible, and are wrong.
     """
-    path, stated = _stated(folder, subject)
+    path, found = _find_settings(folder, subject)
     try:
-        resample = Image.Resampling(stated["resample"])
-        mean, std = ([float(value) for value in stated[name]] for name in ("image_mean", "image_std"))
-        factor = float(stated.get("rescale_factor", 1 / 255)) if stated.get("do_rescale", True) else 1.0
+        resample = Image.Resampling(found["resample"])
+        mean, std = ([float(value) for value in found[name]] for name in ("image_mean", "image_std"))
+        factor = float(found.get("rescale_factor", 1 / 255)) if found.get("do_rescale", True) else 1.0
         if len(mean) != 3 or len(std) != 3 or not np.isfinite([*mean, *std, factor]).all() or min(*std, factor) <= 0:
             raise ValueError("numbers out of range")
     except (KeyError, TypeError, ValueError) as error:
@@ -236,21 +236,21 @@ def read_preprocessing(folder: Path, subject: str, *, floats: bool = False) -> P
         ) from error
     if floats and resample not in FLOAT_FILTERS:
         raise InputError(f"{subject}: {path}: resample: expected 2 (bilinear) or 3 (bicubic), got {int(resample)}")
-    if not stated.get("do_normalize", True):
+    if not found.get("do_normalize", True):
         mean, std = [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
     return Preprocessing(resample=resample, factor=factor, mean=tuple(mean), std=tuple(std), floats=floats)
 
 
-def _stated(folder: Path, subject: str) -> tuple[Path, dict[str, Any]]:
+def _find_settings(folder: Path, subject: str) -> tuple[Path, dict[str, Any]]:
     """The file that states the preprocessing, and what it states."""
     for path in (folder / name for name in FILES):
         try:
-            stated = json.loads(read_foreign_text(path))
+            found = json.loads(read_foreign_text(path))
         except FileNotFoundError:
             continue
         except (OSError, ValueError) as error:
             raise InputError(f"{subject}: {path}: cannot be read: {error}") from error
-        section = stated.get("image_processor") if isinstance(stated, dict) and path.name == FILES[0] else stated
+        section = found.get("image_processor") if isinstance(found, dict) and path.name == FILES[0] else found
         if isinstance(section, dict):
             return path, section
     raise InputError(

@@ -213,7 +213,7 @@ def _read_head(folder: Path, files: Mapping[str, Path], config: Mapping[str, Any
 
 def _teacher_of(args: Mapping[str, Any], adapter: Any, name: str) -> Mapping[str, Any]:
     """What `args.teachers` states of the model to whose space an adapter leads: the entry of its `head_idx`, or the one
-    of its name; empty where nothing is stated."""
+    of its name; empty where it names none."""
     teachers = args.get("teachers")
     entries = [entry for entry in teachers if isinstance(entry, dict)] if isinstance(teachers, list) else []
     for entry in entries:

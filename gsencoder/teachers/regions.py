@@ -589,16 +589,16 @@ class TransformersImageTower:
 
     def __init__(self, folder: Path, device: Device) -> None:
         """Loads model and preprocessing; nothing is fetched from anywhere."""
-        stated = read_config(folder, WHAT)
+        loaded = read_config(folder, WHAT)
         import transformers
 
-        kind = stated.model_type.removesuffix("_vision_model")
+        kind = loaded.model_type.removesuffix("_vision_model")
         loader, self._output = JOINT_IMAGE.get(kind, ("AutoModel", "pooler_output"))
         ignored = ANY if kind in JOINT_IMAGE else ()
-        if kind == "clip" and hasattr(stated, "vision_config"):
+        if kind == "clip" and hasattr(loaded, "vision_config"):
             # Releases state the width of the joint space at the top alone, where the image side does not look.
-            stated.vision_config.projection_dim = stated.projection_dim
-            options = {"config": stated.vision_config}
+            loaded.vision_config.projection_dim = loaded.projection_dim
+            options = {"config": loaded.vision_config}
         else:
             options = {}
         model = load_pretrained(getattr(transformers, loader), folder, WHAT, ignored=ignored, **options)
@@ -638,8 +638,8 @@ def is_joint(model: str) -> bool:
     """Whether the configuration of a folder says that it is the image side of a joint model."""
     if not model or model.lower().endswith(".onnx"):
         return False
-    stated = read_config(find_file(model, "teacher.model", folder=True), WHAT)
-    kind: str = stated.model_type.removesuffix("_vision_model")
+    loaded = read_config(find_file(model, "teacher.model", folder=True), WHAT)
+    kind: str = loaded.model_type.removesuffix("_vision_model")
     return kind in JOINT_IMAGE
 
 

@@ -94,19 +94,19 @@ class TowerInFolder:
 
 def tower_in(folder: Path) -> TowerInFolder:
     """The vision tower of a folder, by its config.json."""
-    stated = read_config(folder, WHAT)
-    config: Any = stated if stated.model_type in KINDS else getattr(stated, "vision_config", None)
+    loaded = read_config(folder, WHAT)
+    config: Any = loaded if loaded.model_type in KINDS else getattr(loaded, "vision_config", None)
     kind = KINDS.get(getattr(config, "model_type", ""))
     if kind is None:
         inner = f" with a {config.model_type} tower" if config is not None else ""
         hint = f"expected one of {', '.join(kind.name for kind in KINDS.values())}, or a vision-language model with one"
-        hint = "give teacher=radio for it" if stated.model_type == "radio" else hint
-        raise InputError(f"{WHAT}: {folder} holds a {stated.model_type} model{inner}; {hint}")
-    if stated.model_type == "clip":
+        hint = "give teacher=radio for it" if loaded.model_type == "radio" else hint
+        raise InputError(f"{WHAT}: {folder} holds a {loaded.model_type} model{inner}; {hint}")
+    if loaded.model_type == "clip":
         # The width of the joint space stands in both configurations, and in old files only in this one.
-        config.projection_dim = stated.projection_dim
-    alone = config is stated
-    cut_out = not alone and stated.model_type not in WITH_OTHER_PARTS
+        config.projection_dim = loaded.projection_dim
+    alone = config is loaded
+    cut_out = not alone and loaded.model_type not in WITH_OTHER_PARTS
     return TowerInFolder(kind=kind, config=config, alone=alone, cut_out=cut_out)
 
 

@@ -233,7 +233,7 @@ class TextTable:
         return next((self._row_of[form] for form in (key, *_singulars_and_plurals(key)) if form in self._row_of), None)
 
     def is_trained(self, word: str) -> bool | None:
-        """Whether the encoder of the features was trained on a word; None where that is not stated."""
+        """Whether the encoder of the features was trained on a word; None where that is not known."""
         if self.trained is None:
             return None
         row = self.find(word)

@@ -97,7 +97,7 @@ def prepare_memory(
     Args:
         folder: created if it does not exist.
         predicted: features of the teacher's space that an encoder predicts for the scene; None = they are fused.
-        sample: number of raw features that are stored beside the bank for `open_raw_sample`, or all if there are fewer.
+        sample: number of raw features that are stored with the bank for `open_raw_sample`, or all if there are fewer.
     """
     if not (prepare.center and prepare.scale):
         raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
@@ -162,7 +162,7 @@ def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def open_raw_sample(folder: Path) -> RawSample:
-    """The raw features that were stored beside the bank."""
+    """The raw features that were stored with the bank."""
     with error_hint(f"remove {folder} to prepare the scene again"), open_archive(folder / SAMPLE_FILE) as file:
         return RawSample(features=file.array("features", "float32", ("n", "D")), total=file.value("total", int))
 

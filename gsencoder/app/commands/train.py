@@ -100,7 +100,9 @@ def run(config: TrainCommandConfig, run: Run) -> None:
         if folder is None:
             return
         figures = {
-            name: encoder_basis_figures(result.outputs[name], dataset.scenes([path.name for path in held_out]))
+            name: encoder_basis_figures(
+                result.outputs.by_teacher[name], dataset.scenes([path.name for path in held_out])
+            )
             for name, dataset in datasets.items()
         }
         write_results(folder, group.work.path, result, figures, heads, config, run)
@@ -143,7 +145,7 @@ def write_results(
     provenance = {"settings": settings(config), "steps": steps, "seconds": seconds, "validation": result.scores}
     provenance["basis"] = figures if len(figures) > 1 else next(iter(figures.values()))
     save_weights(folder / WEIGHTS_FILE, result.encoder, result.outputs, provenance, dtype=config.store)
-    save_tables(folder, result.tables, result.outputs, dtype=config.store)
+    save_tables(folder, result.tables, result.outputs.by_teacher, dtype=config.store)
     if heads.heads:
         save_heads(folder / HEADS_FILE, heads)
     shutil.copy(work / LOG_FILE, folder / LOG_FILE)
