@@ -125,7 +125,7 @@ def test_scenes_are_numbered_by_name_each_with_its_own_parts_and_others_are_vali
 
 
 def test_the_heads_of_the_render_loss_go_to_the_teacher_that_has_them(datasets, tmp_path, monkeypatch):
-    assert begin(datasets, ["wall_0"], tmp_path, monkeypatch)[2] == {"dense": []}
+    assert begin(datasets, ["wall_0"], tmp_path, monkeypatch)[2] == {}
     head = Head(name="siglip.summary", body=torch.nn.Sequential(torch.nn.Linear(4, 3)))
     measured = MeasuredHead(head=head, mean=np.arange(3, dtype=np.float32), scale=2.0, cells=5, cosine=0.9, worst=0.5)
     path = datasets["dense"].folder / HEADS_FILE
