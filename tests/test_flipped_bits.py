@@ -23,7 +23,6 @@ from memory_samples import make_memory
 from scene_files import write_transforms
 from splats import front_camera, random_gaussians
 from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
-from tuning_pairs import png
 
 from gsencoder.app.options import SharedScenesConfig
 from gsencoder.app.output import output_file, output_folder
@@ -31,8 +30,6 @@ from gsencoder.app.run import Run, _is_finished
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import checksums_of, warn_if_modified, with_checksum, write_bytes, write_json
-from gsencoder.data.labels.files import read_checked
-from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, CachedTeacher, read_map, write_map
@@ -188,18 +185,6 @@ KINDS: dict[str, Callable[[Path], Made]] = {
 }
 
 
-def prompts(folder: Path, name: str) -> Made:
-    store = PromptStore(folder)
-    for number in range(2):
-        store.add(f"key {number}", f"What is number {number}?", [png(number)])
-    rows = {key: (prompt.text, prompt.pictures) for key, prompt in store.prompts.items()}
-    if name == PROMPTS_FILE:
-        # A last line without its end counts as cut off, and its prompt is made again.
-        return folder / name, lambda: rows | {k: (p.text, p.pictures) for k, p in PromptStore(folder).prompts.items()}
-    (first, *_) = store.prompts["key 0"].pictures
-    return folder / "pictures" / first, lambda: store.picture(first).tolist()
-
-
 def answers(folder: Path) -> Made:
     row = {"id": "1", "digest": "d", "answer": "On the left.", "tokens": {"prompt": 7}, "seconds": 0.25}
     write_bytes(folder / ANSWERS, json.dumps(with_checksum(row)).encode() + b"\n")
@@ -242,16 +227,11 @@ def _arrays(splat: Any) -> list[Any]:
     return [getattr(splat, name).tolist() for name in ("means", "quats", "scales", "opacities", "sh")]
 
 
-ROWS = [{"scene_id": "a", "object_id": 3, "label": "mug", "score": 0.5}]
 OTHERS: dict[str, Callable[[Path], Made]] = {
-    "rows of prompts": lambda folder: prompts(folder, PROMPTS_FILE),
-    "picture of a prompt": lambda folder: prompts(folder, "picture"),
     "answers of an unfinished run": answers,
     "settings of a fusion": fusion,
     "summary of a finished scene": finished,
     "answers": written(ANSWERS, lambda out: write_bytes(out / ANSWERS, b'{"id": "1", "answer": "x"}\n'), read_answers),
-    "predictions": written("p.json", lambda out: write_json(out / "p.json", ROWS), read_checked),
-    "classes": written("c.csv", lambda out: write_bytes(out / "c.csv", b"id,name\n3,mug\n"), read_checked),
     "transforms": written("transforms.json", lambda out: write_transforms(out, 1), read_json),
     "splat": written("s.ply", lambda o: save_splat(o / "s.ply", random_gaussians(9)), lambda p: _arrays(load_splat(p))),
     "splat of one file": beside,

@@ -37,7 +37,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_room(room, folder / "rooms" / room.name)
         fused = (f"teacher.words={words}", "seeds.voxel=0.04", f"out={folder / 'features' / room.name}", "quiet=true")
         assert cli.main(["fuse", str(folder / "rooms" / room.name), "teacher=labels", *fused]) == 0
-    made = ("min_pixels=60", "per_kind=2", "objects=3", "per_object=1", f"out={folder / 'set'}", "quiet=true")
+    made = ("min_pixels=60", "per_kind=2", "objects=2", "per_object=1", f"out={folder / 'set'}", "quiet=true")
     assert cli.main(["questions", str(folder / "rooms"), *made]) == 0
     return folder
 

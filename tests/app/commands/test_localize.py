@@ -20,9 +20,9 @@ from gsencoder.fusion.folder import load_features, save_features, save_memories
 from gsencoder.infer.from_pose import FromPoseConfig, from_pose
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.relevancy import ThresholdConfig
-from gsencoder.text.table import WORDS_FILE, load_text_table, make_text_table, save_text_table
+from gsencoder.text.table import WORDS_FILE, make_text_table, save_text_table
 from gsencoder.text.vocabulary import closed_table
-from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 CUBE = ORIGIN + np.array([0.3, 0.2, 0.8])
@@ -83,33 +83,6 @@ def test_without_the_options_nothing_is_added_and_without_pictures_none_is_drawn
     assert {path.name for path in asked.iterdir()} - {path.name for path in plain.iterdir()} == {"from_pose.json"}
     assert (plain / "boxes.json").read_bytes() == (asked / "boxes.json").read_bytes()
     assert "from_pose" not in results_of(plain)
-
-
-@pytest.mark.slow
-def test_memories_are_asked_by_their_queries(features: Path, tmp_path: Path) -> None:
-    scene = load_features(features)
-    (kept,) = scene.features.values()
-    bank = MemoryBank(
-        components=np.eye(4, 16, dtype=np.float32), sources=np.zeros((4, 3), np.int32), threshold=0.9, mean=kept.mean,
-        grid_from_image=np.tile(np.eye(2, 3), (4, 1, 1)),
-        coverage=1.0, cosine=1.0, space=kept.space,
-    )  # fmt: skip
-    memory = QueryMemory(
-        queries=kept.decode() - kept.mean, weights=kept.weights, projection=np.eye(16, dtype=np.float32), bank=bank,
-        scoring="centered", temperature=0.02, mean=kept.mean,
-    )  # fmt: skip
-    folder, out = tmp_path / "memory", tmp_path / "boxes"
-    folder.mkdir()
-    save_memories(folder, replace(scene, features={}), {"labels": memory})
-    save_text_table(folder / WORDS_FILE, load_text_table(features / WORDS_FILE))
-    words = ["query=cube", "view=frame 03", "pictures=1", f"out={out}", "quiet=true"]
-    assert cli.main(["localize", str(folder), *words]) == 0
-    (cube,) = json.loads((out / "from_pose.json").read_text())
-    assert cube["visible"]
-    assert np.abs(np.array(cube["position"]) - CUBE).max() < 0.25
-    # Every fourth pixel is looked at, from the middle of the first four on.
-    assert [value % 4 for value in cube["pixel"]] == [2.5, 2.5]
-    assert (out / "pose000_00_cube.png").is_file()
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from instance_scenes import write_text_prediction
 from labeled_scans import ROOM_NAMES, group, names_of_room, write_scannet_labels, write_scannet_scan
 
 from gsencoder.app import main as cli
-from gsencoder.data.labels.classes import ids_of_names, instance_ids, read_label_map, vertex_classes
+from gsencoder.data.labels.classes import ids_of_names, instance_ids, read_label_map
 from gsencoder.data.labels.files import read_integer_lines, write_integer_lines
 from gsencoder.data.labels.scans import read_scannet_labels
 from gsencoder.data.synthetic import make_room
@@ -54,21 +54,21 @@ def write_masks(scans: Path, *, vertices: int = sum(SIZES)) -> Path:
     return folder
 
 
-def write_truth_files(scans: Path, column: str, ids_of: object) -> Path:
-    """What `ids_of` says of the vertices of the scans."""
+def write_truth_files(scans: Path) -> Path:
+    """The instances of the scans."""
     folder = scans.parent / "truth"
     folder.mkdir()
     for scan in scans.iterdir():
         labels = read_scannet_labels(scan)
-        ids = ids_of_names((name for _, name in labels.objects), read_label_map(scans.parent / "map.tsv", column))
-        values = ids_of(labels.instances, dict(labels.objects), ids)  # type: ignore[operator]
+        ids = ids_of_names((name for _, name in labels.objects), read_label_map(scans.parent / "map.tsv", "nyu40id"))
+        values = instance_ids(labels.instances, dict(labels.objects), ids)
         write_integer_lines(folder / f"{scan.name}.txt", values)
     return folder
 
 
 def test_instances_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(scans: Path, tmp_path: Path) -> None:
     write_masks(scans)
-    truth = write_truth_files(scans, "nyu40id", instance_ids)
+    truth = write_truth_files(scans)
     assert read_integer_lines(truth / "scene0000_00.txt")[[0, 150, 270, 380]].tolist() == [5001, 6002, 1003, 40004]
     outs = tmp_path / "scans_out", tmp_path / "files_out"
     assert cli.main([*words_of("instances", scans), f"out={outs[0]}", "quiet=true"]) == 0
@@ -81,69 +81,20 @@ def test_instances_of_scans_have_the_scores_of_the_truth_that_is_written_of_them
     assert results["ap"] == pytest.approx((1 + 4 / 9) / 2)
 
 
-def test_labels_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(scans: Path, tmp_path: Path) -> None:
-    predictions = tmp_path / "predictions"
-    predictions.mkdir()
-    for scene in ("scene0000_00", "scene0001_00"):
-        write_integer_lines(predictions / f"{scene}.txt", np.repeat([5, 6, 5, 1], SIZES))
-    truth = write_truth_files(scans, "nyu40id", vertex_classes)
-    outs = tmp_path / "scans_out", tmp_path / "files_out"
-    assert cli.main([*words_of("semantics", scans), f"out={outs[0]}", "quiet=true"]) == 0
-    words = ["score", "semantics", f"predictions={predictions}", f"truth={truth}", "classes=scannet20"]
-    assert cli.main([*words, f"out={outs[1]}", "quiet=true"]) == 0
-    results = results_of(outs[0])
-    assert results == results_of(outs[1])
-    # Paper is ignored. Chairs: 150 of 150 + 110; sofas: all; walls: none.
-    assert (results["ignored"], results["vertices"]) == (2 * 40, 2 * 380)
-    assert results["miou"] == pytest.approx((150 / 260 + 1 + 0) / 3)
-
-
 def test_folders_that_do_not_fit_are_refused(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    predictions = write_masks(scans)
+    write_masks(scans)
     without_map = [word for word in words_of("instances", scans) if not word.startswith("label_map")]
     assert "no truth; expected SCENE.txt for each scene (labels of scans need" in refusal(capsys, *without_map)
-    truth = write_truth_files(scans, "nyu40id", instance_ids)
+    truth = write_truth_files(scans)
     words = [word for word in words_of("instances", scans) if not word.startswith("truth")]
     message = refusal(capsys, *words, f"truth={truth}")
     assert "no scans; expected SCENE/SCENE.aggregation.json" in message
     assert "missing.tsv: no such file" in refusal(capsys, *without_map, f"label_map={tmp_path / 'missing.tsv'}")
-    (predictions / "scene0001_00.txt").rename(predictions / "scene0009_00.txt")
-    message = refusal(capsys, *words_of("instances", scans))
-    assert "scene0009_00.txt: there is no truth of this scene" in message
-    (predictions / "scene0009_00.txt").unlink()
-    assert "no prediction of 1 scene: scene0001_00" in refusal(capsys, *words_of("instances", scans))
     write_masks(scans, vertices=7)
     assert "has 7 lines, and the scene 420 vertices" in refusal(capsys, *words_of("instances", scans))
     write_masks(scans)
     (scans / "scene0001_00" / "scene0001_00_vh_clean_2.ply").unlink()
     assert "scene0001_00_vh_clean_2.ply: no such file" in refusal(capsys, *words_of("instances", scans))
-
-
-SENTENCES = [
-    {"scene_id": "scene0000_00", "object_id": str(number), "object_name": name, "ann_id": "0"}
-    for number, name in enumerate(("office_chair", "couch", "wall"))
-]
-
-
-def test_scanrefers_own_file_is_truth(scans: Path, tmp_path: Path) -> None:
-    truth, predictions = tmp_path / "ScanRefer_filtered_val.json", tmp_path / "pred.json"
-    truth.write_text(json.dumps([each | {"description": "It.", "token": ["it"]} for each in SENTENCES]))
-    boxes = read_scannet_labels(scans / "scene0000_00").boxes(aligned=True)
-    rows = [
-        {key: each[key] for key in ("scene_id", "object_id", "ann_id")} | {"bbox": np.array(boxes[row + 1]).tolist()}
-        for row, each in enumerate(SENTENCES)
-    ]
-    predictions.write_text(json.dumps([*rows[:2], rows[2] | {"bbox": None}]))
-    words = ["score", "referring", f"predictions={predictions}", f"truth={truth}", f"scans={scans}", "quiet=true"]
-    assert cli.main([*words, f"label_map={tmp_path / 'map.tsv'}", f"out={tmp_path / 'out'}"]) == 0
-    results = results_of(tmp_path / "out")
-    # The wall is of the class others; each is the only one of its class, and the wall alone has no box.
-    assert (results["acc_50"], results["unique_50"]) == (pytest.approx(2 / 3), pytest.approx(2 / 3))
-    assert results["tables"]["top_1"]["unique"]["not_in_others"] == {"sentences": 2, "acc25": 1, "acc50": 1}
-    assert cli.main([*words, f"out={tmp_path / 'unknown'}"]) == 0
-    results = results_of(tmp_path / "unknown")
-    assert (results["acc_50"], results["unique_50"]) == (pytest.approx(2 / 3), None)
-    assert "3 sentences in the overall columns alone" in (tmp_path / "unknown" / "table.md").read_text()
 
 
 @pytest.mark.slow

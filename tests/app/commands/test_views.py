@@ -71,14 +71,6 @@ def test_several_words_and_boxes_are_looked_at_together(features: Path, tmp_path
     assert (shown.max(axis=0) > 0.02).all()
 
 
-def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
-    out = tmp_path / "views"
-    assert cli.main(["views", str(features), "choose.method=uniform", f"out={out}", *QUICK]) == 0
-    rows = json.loads((out / "views.json").read_text())
-    assert [row["frame"] for row in rows] == [0, 4, 7, 11]
-    assert all(row["sights"] == [] for row in rows)
-
-
 @pytest.mark.parametrize(
     ("words", "problem"),
     [

@@ -13,15 +13,11 @@ from gsencoder.data.labels.files import (
     brief,
     corner_bounds,
     entries_of,
-    flag_value,
     id_value,
     name_value,
     number,
     object_id,
     refuse_repeated,
-    scene_name,
-    text_list,
-    text_value,
 )
 
 HERE = "f.json: entry 3"
@@ -71,16 +67,6 @@ def test_bounds_are_those_of_all_corners_in_any_order_or_of_a_lower_and_an_upper
     )
 
 
-def test_texts_are_taken_to_their_largest_length_and_empty_ones_where_allowed() -> None:
-    assert text_value("a" * 20_000, HERE, "t") == "a" * 20_000
-    assert "t has 20,001 characters, expected at most 20,000" in refused(text_value, "a" * 20_001, HERE, "t")
-    assert text_value("", HERE, "t", empty=True) == ""
-    assert f"{HERE}: t is empty; expected a text" in refused(text_value, " \n", HERE, "t")
-    assert text_list(["a", ""], HERE, "t", empty=True) == ("a", "")
-    assert f"{HERE}: t[1] is empty" in refused(text_list, ["a", ""], HERE, "t")
-    assert "t must be a list of texts, got 'a'" in refused(text_list, "a", HERE, "t")
-
-
 def test_names_and_ids_are_texts_of_one_line_and_ids_are_numbers_as_well() -> None:
     assert name_value("a" * 200, HERE, "label") == "a" * 200
     assert (id_value(7, HERE, "id"), id_value("a b", HERE, "id"), id_value(-3, HERE, "id")) == ("7", "a b", "-3")
@@ -92,20 +78,6 @@ def test_names_and_ids_are_texts_of_one_line_and_ids_are_numbers_as_well() -> No
         assert "id must be a whole number or a text of one line" in refused(id_value, wrong, HERE, "id")
     for read in (name_value, id_value):
         assert "must be a" in refused(read, "a" * 201, HERE, "label")
-
-
-def test_a_scene_is_called_as_a_folder_can_be() -> None:
-    assert scene_name("a" * 255, HERE) == "a" * 255
-    assert scene_name("..a", HERE) == "..a"
-    for wrong in (".", "..", "a/b", "a" * 256, "a\tb"):
-        assert "the scene must be a name that a folder can have" in refused(scene_name, wrong, HERE)
-
-
-def test_flags_are_0_or_1_or_false_or_true_or_missing() -> None:
-    read = [flag_value(value, HERE, "others") for value in (0, 1, False, True, None)]
-    assert read == [False, True, False, True, None]
-    for wrong in (2, -1, "1", 1.0):
-        assert "others must be 0 or 1" in refused(flag_value, wrong, HERE, "others")
 
 
 def test_entries_have_their_number_and_their_key_in_messages() -> None:
@@ -125,10 +97,3 @@ def test_two_entries_of_one_key_are_named_with_their_numbers(tmp_path: Any) -> N
     refuse_repeated(path, ["a", "b", "c"], str)
     problem = refused(refuse_repeated, path, ["a", "b", "c", "b"], lambda key: f"<{key}>", what="question_id")
     assert problem == f"{path}: entries 1 and 3 have one question_id: <b>; expected each once"
-
-
-def test_what_is_shown_of_a_value_is_short_and_on_one_line() -> None:
-    values = ([1], {"a": 1}, None, "a\nb", 1.5)
-    assert [*map(shown, values)] == ["a list", "an object", "nothing", "'a\\nb'", "1.5"]
-    assert brief("a" * 100) == repr("a" * 60)
-    assert len(brief(10**100)) == 80
