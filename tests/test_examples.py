@@ -25,7 +25,7 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "room"
-    write_room(make_room(0, objects=6, views=4, width=120, height=90), folder)
+    write_room(make_room(0, objects=6, views=6, width=120, height=90), folder)
     return folder
 
 

@@ -1,7 +1,6 @@
 """`gsencoder memory`: what it writes is what localize, views and pack read; pictures; what is continued or refused."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,6 @@ from gsencoder.models.encoder import GaussianEncoder, save_weights
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
 from gsencoder.train import memory as training
-from gsencoder.train.memory import fingerprint_of
 from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow
@@ -222,12 +220,6 @@ def test_settings_and_scenes_that_cannot_be_are_refused_in_one_line(room, tmp_pa
     monkeypatch.setattr("gsencoder.infer.memory_pictures.find_spec", lambda name: None)
     assert "pip install 'gsencoder[umap]'" in refusal(capsys, *palette, "umap=true")
     assert not (tmp_path / "out").exists()
-
-
-def test_banks_of_as_many_components_have_fingerprints_of_their_own() -> None:
-    bank = make_memory().bank
-    other = replace(bank, components=bank.components + np.float32(1e-3))
-    assert fingerprint_of(bank) == fingerprint_of(replace(bank)) != fingerprint_of(other)
 
 
 def test_settings_that_a_form_or_a_memory_does_not_take_are_refused(tmp_path, capsys):

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -124,27 +123,6 @@ def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(g
     assert made[3:] == ["Is there a pen holder?"]
     assert cli.main(words(given, tmp_path / "d", *prepare, "choose.count=1")) == 0
     assert len(made) == 7
-
-
-def test_an_interrupted_command_goes_on_as_if_nothing_had_happened(given, tmp_path, monkeypatch, interrupts):
-    from gsencoder.train.loop import TrainerConfig
-
-    more = ("train.steps=6", f"prepared={tmp_path / 'prompts'}")
-    assert cli.main(words(given, tmp_path / "whole", *more)) == 0
-    rate_at = TrainerConfig.rate_at
-
-    def stop(self: TrainerConfig, step: int, final: float) -> float:
-        if step == 4:
-            signal.raise_signal(signal.SIGINT)
-        return rate_at(self, step, final)
-
-    monkeypatch.setattr(TrainerConfig, "rate_at", stop)
-    assert cli.main(words(given, tmp_path / "cut", *more)) == 130
-    assert (tmp_path / "cut.training" / "checkpoint.safetensors").is_file()
-    monkeypatch.undo()
-    assert cli.main(words(given, tmp_path / "cut", *more)) == 0
-    adapters = [(tmp_path / name / "adapter_model.safetensors").read_bytes() for name in ("cut", "whole")]
-    assert adapters[0] == adapters[1]
 
 
 def test_rendered_features_take_the_place_of_the_tower(given: Path, tmp_path: Path) -> None:
