@@ -186,18 +186,6 @@ def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path: Path, monkeypatch
     np.testing.assert_array_equal(made, HashTower().embed(["mug"]))
 
 
-def test_a_cache_of_too_many_phrases_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    monkeypatch.setattr("gsencoder.text.table.MAX_PHRASES", 3)
-    tower = HashTower()
-    for phrase in ("a", "b", "c", "a", "d", "d", "a"):
-        np.testing.assert_array_equal(
-            cached_vectors("identity", ("{}",), [phrase], tower.embed), HashTower().embed([phrase])
-        )
-    # Three fit; the fourth is alone in the file, and the first has to be computed again.
-    assert tower.asked == ["a", "b", "c", "d", "a"]
-
-
 def test_a_vocabulary_is_made_of_the_tower_and_the_templates_of_its_settings(tmp_path: Path) -> None:
     save_tokenizer(tmp_path / "tokenizer.json", (*WORDS[:4], "the", *sorted(set(" ".join(REFERENCE_NOUNS).split()))))
     save_graph(tmp_path / "model.onnx", rows=1000)

@@ -153,19 +153,6 @@ def test_folders_that_do_not_fit_are_one_line(saved: Any) -> None:
     assert "holds no model that transformers reads" in problem()
 
 
-def test_a_model_without_a_largest_length_takes_any_phrase(saved: Any) -> None:
-    config = transformers.BloomConfig(vocab_size=len(WORDS), hidden_size=16, n_layer=1, n_head=2)
-    assert not hasattr(config, "max_position_embeddings")
-    folder, model = saved(lambda: transformers.BloomModel(config))
-    tower = TransformersTower(TransformersTextConfig(model=str(folder), pooling="eos"))
-    phrase = "mug " * 200
-    tokenizer = transformers.AutoTokenizer.from_pretrained(folder)
-    with torch.inference_mode():
-        tokens = model(**tokenizer(phrase, return_tensors="pt")).last_hidden_state[0].numpy()
-    assert len(tokens) == 202
-    np.testing.assert_allclose(tower.embed([phrase])[0], unit(tokens[-1]), atol=1e-5)
-
-
 def test_a_phrase_that_would_be_cut_is_refused(saved: Any) -> None:
     folder, _ = saved(clip)
     tower = TransformersTower(TransformersTextConfig(model=str(folder)))
