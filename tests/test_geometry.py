@@ -19,7 +19,6 @@ from gsencoder.geometry import (
     transform,
     unproject_points,
 )
-from gsencoder.types import checks as numpy_poses
 from gsencoder.types import scene as numpy_cameras
 
 
@@ -47,10 +46,10 @@ def test_the_pinhole_and_poses_of_tensors_are_those_of_arrays(kind):
     cameras, points = random_cameras(), (3 * np.random.default_rng(0).normal(size=(40, 3))).astype(kind)
     for view in range(len(cameras)):
         pose, K = cameras.cam_from_world[view].astype(kind), cameras.Ks[view].astype(kind)
-        local = numpy_poses.transform(pose, points)
+        local = numpy_cameras.transform(pose, points)
         np.testing.assert_allclose(transform(*map(torch.from_numpy, (pose, points))).numpy(), local, atol=50 * eps)
         inverse = invert_rigid(torch.from_numpy(pose))
-        np.testing.assert_allclose(inverse.numpy(), numpy_poses.invert_rigid(pose), atol=50 * eps)
+        np.testing.assert_allclose(inverse.numpy(), numpy_cameras.invert_rigid(pose), atol=50 * eps)
         tensors = torch.from_numpy(np.ascontiguousarray(local)), torch.from_numpy(K)
         for min_depth in (None, 0.7):
             pixels = numpy_cameras.project_points(local, K, min_depth=min_depth)
