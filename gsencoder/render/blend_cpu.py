@@ -164,7 +164,7 @@ def project(
         u, v, half width, half height, conic a, b, c, squared radius, opacity in units of the lattice, where rays lie on
         whole numbers; the Gaussians that touch the image, ascending, whose rows alone are filled; and their depths.
     """
-    n = len(gaussians)
+    n = len(gaussians.means)
     out, index, depths = np.empty((n, 9)), np.empty(n, np.int32), np.empty(n)
     cuts = np.linspace(0, n, PIECES + 1).astype(np.int64)
     pose, K = pose.astype(np.float64), K.astype(np.float64)
@@ -400,7 +400,7 @@ def blend_weights(
         between: smallest and largest depth of the entries that each row stores.
     """
     projected, index, z = project(gaussians, pose, K, *size, lattice, eps2d=eps2d, near=near)
-    depths = np.zeros(len(gaussians), np.float32)
+    depths = np.zeros(len(projected), np.float32)
     depths[index] = z
     tile = lattice.tile
     tiles_x, tiles_y = -(-lattice.width * lattice.side // tile), -(-lattice.height * lattice.side // tile)
