@@ -14,11 +14,7 @@ from gsencoder.core.process import ProcessRank, available_cores, rank_from_envir
 from gsencoder.core.threads import threads_of_torch
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.train.distributed import (
-    cpu_share,
-    gpu_index,
-    join_processes,
-)
+from gsencoder.train.distributed import cpu_share, gpu_index, join_processes
 from gsencoder.train.prepared import CLASS_BALANCE_FILE, PreparedDataset
 from gsencoder.train.samples import TrainingScene
 

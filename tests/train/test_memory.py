@@ -39,7 +39,7 @@ from gsencoder.train.samples import sample_rows
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory
 
 SHORT = replace(memory_training(), steps=8, warmup=2, log_every=1, checkpoint_every=0.0)
-LONG = replace(memory_training(), steps=150, warmup=10, learning_rate=0.06)
+LONG = replace(memory_training(), steps=100, warmup=10, learning_rate=0.06)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,6 @@ def rendered_cosine(memory: QueryMemory) -> float:
     scene = wall(0)
     teacher = BlendedTeacher(scene)
     cosines = []
-    assert scene.gaussians is not None
     for view in range(2):
         target = teacher.feature_map(scene.views, view)
         b = blend(scene.gaussians, scene.views.cameras, view, like=target)
@@ -86,7 +85,7 @@ def test_training_brings_rendered_features_to_the_teachers(prepared, tmp_path, s
     before = rendered_cosine(untrained_memory(prepared, config))
     memories, state = train_memory({"hidden": prepared}, config, LONG, work=tmp_path)
     after = rendered_cosine(memories["hidden"])
-    assert state.step == 150
+    assert state.step == 100
     # Products of features with a long mean hardly tell components apart at first.
     assert after > max(before, 0.95 if scoring != "dot" else 0.8)
 
@@ -194,7 +193,6 @@ def test_rows_are_those_of_gaussians_that_were_seen(prepared: MemoryScene) -> No
 def test_unseen_gaussians_take_no_part_in_what_a_memory_renders(prepared: MemoryScene) -> None:
     memory = untrained_memory(prepared, MemoryConfig(channels=4))
     scene = wall(0)
-    assert scene.gaussians is not None
     b = blend(scene.gaussians, scene.views.cameras, 0)
     weights = memory.weights.copy()
     weights[::3] = 0
@@ -293,10 +291,7 @@ def test_both_terms_of_the_loss_count_each_row_by_its_weight(prepared: MemorySce
 
 def fewer_components(bank: MemoryBank) -> MemoryBank:
     return replace(
-        bank,
-        components=bank.components[1:],
-        sources=bank.sources[1:],
-        grid_from_image=bank.grid_from_image[1:],
+        bank, components=bank.components[1:], sources=bank.sources[1:], grid_from_image=bank.grid_from_image[1:]
     )
 
 
@@ -410,7 +405,6 @@ def test_the_fit_is_how_far_rendered_features_are_from_the_teachers_maps_in_all_
     config = MemoryConfig(channels=12, scoring="dot", temperature=20.0)
     memory = untrained_memory(made, config)
     scene = wall(0)
-    assert scene.gaussians is not None
     teacher, tally = BlendedTeacher(scene), RenderedTally(memory.mean)
     for view in range(2):
         target = teacher.feature_map(scene.views, view)
@@ -429,7 +423,6 @@ def test_the_fit_is_how_far_rendered_features_are_from_the_teachers_maps_in_all_
 
 def test_raw_features_are_stored_beside_the_bank_when_they_are_asked_for(tmp_path, monkeypatch):
     scene = wall(0)
-    assert scene.views is not None
     teacher = BlendedTeacher(scene)
     prepare_memory(scene, teacher, tmp_path / "made", BankConfig(), PREPARE)
     with pytest.raises(InputError, match=r"sample\.safetensors"):

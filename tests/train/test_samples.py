@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from joint_training import Datasets, batch_of, joint
 from safetensors.numpy import load_file
-from splats import front_camera
+from splats import front_camera, random_gaussians
 from training_scenes import LOSSES, SMALL, samples, small_encoder
 
 from gsencoder.core.errors import InputError
@@ -182,23 +182,6 @@ def test_where_all_weights_are_1_samples_are_the_same_without_looking_up_classes
         assert same(sample._replace(teachers=()), looked_up._replace(teachers=()))
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"sampling": SamplingConfig(views=2, gaussians=200)},
-        {"losses": LossConfig(rarity=0.0, contrast_weight=0.3)},
-        {"losses": LossConfig(rarity=0.5, contrast_weight=0.0)},
-    ],
-)
-def test_classes_are_looked_up_for_rare_centers_contrast_or_weights_of_rare_classes(dataset, changes):
-    nothing = {
-        "sampling": SamplingConfig(views=2, gaussians=200, rare_centers=0.0),
-        "losses": LossConfig(rarity=0.0, contrast_weight=0.0),
-    }
-    recipe = samples(*dataset, **{**nothing, **changes}).recipe
-    assert recipe.uses_classes(recipe.teachers[0])
-
-
 def test_all_kinds_are_equally_often_the_center_of_a_sample(dataset, monkeypatch):
     recipe, drawn = samples(*dataset).recipe, list[np.ndarray]()
 
@@ -326,15 +309,9 @@ def test_a_crop_holds_the_nearest(count: int, wanted: int) -> None:
 
 def cameras(count: int) -> Cameras:
     """Cameras in a row that look along +z."""
-    one = front_camera()
-    poses = np.repeat(one.cam_from_world, count, axis=0)
-    poses[:, 0, 3] = -10.0 * np.arange(count)
-    return Cameras(
-        cam_from_world=poses,
-        Ks=np.repeat(one.Ks, count, axis=0),
-        widths=np.repeat(one.widths, count),
-        heights=np.repeat(one.heights, count),
-    )
+    made = front_camera().select([0] * count)
+    made.cam_from_world[:, 0, 3] = -10.0 * np.arange(count)
+    return made
 
 
 def cloud(count: int = 1000, places: int = 1) -> np.ndarray:
@@ -374,16 +351,6 @@ def test_a_crop_holds_the_gaussians_nearest_to_its_center_that_the_views_see() -
     assert set(rows) == set(visible[np.argsort(distances)[:20]])
 
 
-def test_a_rare_target_is_often_the_center_of_a_crop() -> None:
-    points, camera = cloud(), front_camera()
-    chances = np.full(1000, 1e-3, np.float32)
-    visible = np.flatnonzero(in_frusta(points, camera))
-    chances[visible[0]] = 1e3
-    config = SamplingConfig(views=1, rare_centers=1.0)
-    for seed in range(5):
-        assert visible[0] in choose_crop(points, camera, chances, config, 5, RNG(seed))[1]
-
-
 def test_a_camera_that_looks_into_the_void_gives_way_to_one_that_sees_something() -> None:
     points, row = cloud(50), cameras(3)  # All before the first camera.
     for size in (0, 5):
@@ -421,16 +388,8 @@ def test_crops_are_of_sizes_in_equal_ratios() -> None:
 NOTHING = Augmentation(turn=0.0, tilt=0.0, mirror=0.0, scale=0.0, jitter=0.0, drop=0.0, light=0.0, tint=0.0, noise=0.0)
 
 
-def splat(count: int = 30) -> Gaussians:
-    rng = np.random.default_rng(0)
-    quats = rng.normal(size=(count, 4))
-    return Gaussians(
-        means=rng.normal(size=(count, 3)).astype(np.float32),
-        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
-        scales=rng.uniform(0.01, 0.3, (count, 3)).astype(np.float32),
-        opacities=rng.uniform(0, 1, count).astype(np.float32),
-        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
-    )
+def splat() -> Gaussians:
+    return random_gaussians(30, center=(0, 0, 0))
 
 
 def orthonormal(seed: int, mirrored: bool) -> np.ndarray:

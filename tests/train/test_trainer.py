@@ -3,6 +3,9 @@
 import os
 import shutil
 import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from archives import header_of
+from forked_ranks import RankServer
 from safetensors.numpy import load_file
 from training_scenes import (
     LOSSES,
@@ -22,6 +26,7 @@ from training_scenes import (
     small_encoder,
     steps_in,
     trainer,
+    weights_in,
 )
 
 from gsencoder.core.archive import write_archive
@@ -184,9 +189,15 @@ def test_beside_a_gpu_samples_are_made_by_the_cores_that_are_left_as_far_as_shar
     assert automatic_workers(torch.device("cpu"), process) == 0
 
 
-def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path / "whole").run()
+@pytest.fixture(scope="module")
+def whole(dataset: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    trainer(dataset, folder).run()
+    return folder
 
+
+def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset, whole, tmp_path):
     def stop_at_five(steps: range, label: str):
         for step in steps:
             if step == 5:
@@ -199,14 +210,13 @@ def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset: Prep
     again = trainer(dataset, tmp_path / "cut")
     assert again.state.step == 5
     again.run()
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
-    assert_same_weights(tmp_path / "cut", tmp_path / "whole")
+    assert rows(tmp_path / "cut") == rows(whole)
+    assert_same_weights(tmp_path / "cut", whole)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.usefixtures("interrupts")
-def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path / "whole").run()
+def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, whole: Path, tmp_path: Path) -> None:
     cut = trainer(dataset, tmp_path / "cut")
     step = cut.optimizer.step
 
@@ -220,8 +230,8 @@ def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, tmp_pat
         cut.run()
     assert steps_in(tmp_path / "cut") == 5
     trainer(dataset, tmp_path / "cut").run()
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
-    assert_same_weights(tmp_path / "cut", tmp_path / "whole")
+    assert rows(tmp_path / "cut") == rows(whole)
+    assert_same_weights(tmp_path / "cut", whole)
 
 
 @pytest.mark.parametrize(("cause", "saved"), [(Stopped(15), True), (KeyboardInterrupt(), True), (None, False)])
@@ -284,23 +294,107 @@ def test_rows_of_steps_that_are_done_again_are_taken_out_of_the_log(dataset: Pre
     assert [int(row["step"]) for row in read_log(tmp_path / LOG_FILE)] == list(range(1, 9))
 
 
-def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path).run()
+def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, whole: Path) -> None:
     with pytest.raises(InputError, match=r"was made with run=1, and this run asks run=2"):
-        encoder_trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
+        encoder_trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=whole, settings={"run": 2})
     for key, message in (("samples_per_step", "a step had 1 samples, and this run has 4"), ("spaces", "changed")):
+        settings = {"run": 1, key: 4}
         with pytest.raises(InputError, match=message):
-            encoder_trainer(
-                small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 1, key: 4}
-            )
+            encoder_trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=whole, settings=settings)
 
 
 @pytest.mark.parametrize(
     ("key", "value"), [("step", -5), ("step", 1000), ("unlogged", [{"loss": "x"}]), ("closed", False)]
 )
-def test_a_state_that_no_run_was_in_is_refused(dataset: Prepared, tmp_path: Path, key: str, value: object) -> None:
-    trainer(dataset, tmp_path).run()
+def test_a_state_that_no_run_was_in_is_refused(dataset, whole, tmp_path, key, value):
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     path = tmp_path / TRAINING_CHECKPOINT_FILE
     write_archive(path, load_file(path), {**header_of(path), key: value})
     with pytest.raises(InputError, match="give resume=false"):
         trainer(dataset, tmp_path)
+
+
+EIGHT_GPUS = """
+import torch
+
+def refuse() -> None:
+    raise AssertionError("the GPU was used")
+
+torch.cuda.is_available, torch.cuda.device_count, torch.cuda._lazy_init = lambda: True, lambda: 8, refuse
+"""
+"""Lets torch say that the machine has GPUs, and lets every use of one fail."""
+SCRIPT = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from training_scenes import LOSSES, SHORT, samples, small_encoder
+from gsencoder.train.distributed import join_processes
+from gsencoder.train.prepared import PreparedDataset, PreparedScene
+from gsencoder.train.run import encoder_trainer
+
+if __name__ == "__main__":
+    dataset = PreparedDataset(Path({prepared!r}), {{"made": "for a test"}})
+    names = {names!r}
+    with join_processes("cpu") as (process, device):
+        config = replace(SHORT, steps={steps}, accumulate={accumulate})
+        trainer = encoder_trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
+                          settings={{}}, process=process, device=device)
+        trainer.run()
+    threads = [(task / "comm").read_text() for task in Path("/proc/self/task").glob("*")]
+    sys.exit(any("gloo" in name for name in threads) and "threads of the process group are left: " + str(threads))
+"""
+
+
+def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int, before: str = "") -> Path:
+    folder.mkdir(exist_ok=True)
+    path = folder / "run.py"
+    path.write_text(
+        before
+        + SCRIPT.format(
+            tests=str(Path(__file__).resolve().parent.parent),
+            prepared=str(dataset[0].folder),
+            names=dataset[1],
+            steps=steps,
+            accumulate=accumulate,
+            folder=str(folder),
+        )
+    )
+    return path
+
+
+@pytest.mark.alone
+def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_one(dataset, tmp_path, ranks):
+    alone = script(dataset, tmp_path / "one", steps=4, accumulate=2)
+    pair = script(dataset, tmp_path / "two", steps=4, accumulate=1, before=EIGHT_GPUS)
+    ranks.started(alone, count=1).end_well()
+    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*launcher, str(pair)], check=False, timeout=300, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    # AdamW does not see the scale of a gradient, and clipping hides it: the norm is what tells.
+    for column in ("loss", "field", "render", "contrast", "gradient"):
+        two, one = (losses(tmp_path / name, column) for name in ("two", "one"))
+        np.testing.assert_allclose(two, one, rtol=1e-4 if column != "gradient" else 1e-3)
+    two, one = weights_in(tmp_path / "two"), weights_in(tmp_path / "one")
+    assert two.keys() == one.keys()
+    for name, value in two.items():
+        np.testing.assert_allclose(value, one[name], atol=2e-3)
+
+
+def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path, ranks: RankServer) -> None:
+    whole = script(dataset, tmp_path / "whole", steps=24, accumulate=1)
+    cut = script(dataset, tmp_path / "cut", steps=24, accumulate=1)
+    ranks.started(whole, count=1).end_well()
+    running = ranks.started(cut, count=1)
+    log, deadline = tmp_path / "cut" / LOG_FILE, time.monotonic() + 120
+    while time.monotonic() < deadline and not (log.is_file() and len(log.read_text().splitlines()) > 5):
+        time.sleep(0.02)
+    running.kill()
+    assert len(losses(tmp_path / "cut")) < 24
+    assert 0 < steps_in(tmp_path / "cut") < 24
+    ranks.started(cut, count=1).end_well()
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert_same_weights(tmp_path / "cut", tmp_path / "whole")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from command_runs import QUICK
+from command_runs import QUICK, refusal
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands.train import TrainCommandConfig
@@ -22,7 +23,7 @@ from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.folder import load_features
 from gsencoder.models.encoder import load_weights
-from gsencoder.text.table import load_text_table
+from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train import TrainConfig, train
 
 pytestmark = pytest.mark.slow
@@ -74,65 +75,46 @@ def test_the_python_call_trains_the_same_encoder_as_the_command(rooms: Path, tra
 
 def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trained: Path, tmp_path: Path) -> None:
     out, boxes = tmp_path / "features", tmp_path / "boxes"
-    encode = ["encode", str(rooms / "room_2"), f"weights={trained}", f"out={out}", "quiet=true"]
+    encode = ["encode", str(rooms / "room_2"), f"weights={trained}", f"out={out}", "seeds.voxel=0.06", "quiet=true"]
     assert cli.main(encode) == 0
     results = summary_of(out)["results"]
     scene = load_features(out)
-    assert scene.gaussians is not None
     assert results["gaussians"] == results["seen"] == len(scene.gaussians)
     word = min(thing.name for thing in load_scene(rooms / "room_2").objects if thing.name)
-    arguments = [
-        "localize",
-        str(out),
-        f"query={word}",
-        f"out={boxes}",
-        "pictures=0",
-        "localize.threshold.fixed=0.0",
-        "quiet=true",
-    ]
-    assert cli.main(arguments) == 0
+    arguments = ["localize", str(out), f"query={word}", f"out={boxes}", "localize.threshold.fixed=0.0"]
+    assert cli.main([*arguments, "pictures=0", "quiet=true"]) == 0
     # In chunks it is nearly the same, and for several scenes each has a folder of its own.
     several = ["encode", str(rooms / "room_1"), str(rooms / "room_2"), f"weights={trained / 'encoder.safetensors'}"]
-    assert cli.main([*several, f"out={tmp_path / 'many'}", "encode.chunk=4000", "quiet=true"]) == 0
+    assert cli.main([*several, f"out={tmp_path / 'many'}", "seeds.voxel=0.06", "encode.chunk=800", "quiet=true"]) == 0
     parts = next(iter(load_features(tmp_path / "many" / "room_2").features.values()))
     whole = next(iter(scene.features.values()))
-    assert len(parts) == len(whole) > 4000
+    assert len(parts) == len(whole) > 800
     assert 0 < field_error(parts, whole).centered < 0.1
 
 
 def test_an_encoder_is_judged_by_either_protocol(rooms: Path, trained: Path, tmp_path: Path) -> None:
-    words = f"teacher.words={rooms / 'words.safetensors'}"
-    for protocol in ("naming", "localization"):
-        out = tmp_path / protocol
-        arguments = [
-            "evaluate",
-            str(rooms / "room_2"),
-            f"protocol={protocol}",
-            f"weights={trained}",
-            words,
-            f"out={out}",
-        ]
-        extra = ["min_views=1", "min_pixels=1"] if protocol == "localization" else []
-        assert cli.main([*arguments, *extra, "quiet=true"]) == 0
+    common = ["evaluate", str(rooms / "room_2"), f"teacher.words={rooms / 'words.safetensors'}"]
+    common += ["seeds.voxel=0.06", "quiet=true"]
+    for protocol, extra in (("naming", ()), ("localization", ("min_views=1", "min_pixels=1"))):
+        words = [f"protocol={protocol}", f"weights={trained}", f"out={tmp_path / protocol}", *extra]
+        assert cli.main([*common, *words]) == 0
     naming = summary_of(tmp_path / "naming")["results"]
     assert 0 <= naming["accuracy"] <= 1
     assert "other" in naming["names"]
     # The teacher's own features name themselves.
-    itself = ["evaluate", str(rooms / "room_2"), "protocol=naming", words, f"out={tmp_path / 'self'}", "quiet=true"]
-    assert cli.main(itself) == 0
+    assert cli.main([*common, "protocol=naming", f"out={tmp_path / 'self'}"]) == 0
     assert summary_of(tmp_path / "self")["results"]["accuracy"] == 1
 
 
 def test_the_names_of_other_rooms_are_absent(rooms: Path, trained: Path, tmp_path: Path) -> None:
     scenes = [str(rooms / "room_1"), str(rooms / "room_2")]
     words = [f"teacher.words={rooms / 'words.safetensors'}", "protocol.min_views=1", "protocol.min_pixels=1"]
+    words += ["seeds.voxel=0.06", "quiet=true"]
     for name, weights in (("fused", ()), ("encoded", (f"weights={trained}",))):
-        arguments = ["evaluate", *scenes, "protocol=absent", *words, *weights, f"out={tmp_path / name}", "quiet=true"]
-        assert cli.main(arguments) == 0
+        assert cli.main(["evaluate", *scenes, "protocol=absent", *words, *weights, f"out={tmp_path / name}"]) == 0
         results = summary_of(tmp_path / name)["results"]
-        assert (
-            len((tmp_path / name / "words.csv").read_text().splitlines()) == 1 + results["present"] + results["absent"]
-        )
+        rows = (tmp_path / name / "words.csv").read_text().splitlines()
+        assert len(rows) == 1 + results["present"] + results["absent"]
     results = summary_of(tmp_path / "fused")["results"]
     assert results["absent"] > 0
     assert results["auroc"] == 1
@@ -140,14 +122,14 @@ def test_the_names_of_other_rooms_are_absent(rooms: Path, trained: Path, tmp_pat
     # A vocabulary that is given stands for the names of the scenes.
     elsewhere = next(name for name, row in results["names"].items() if row["absent"])
     arguments = ["evaluate", *scenes, "protocol=absent", *words, f"protocol.vocabulary={elsewhere}"]
-    assert cli.main([*arguments, f"out={tmp_path / 'one'}", "quiet=true"]) == 0
+    assert cli.main([*arguments, f"out={tmp_path / 'one'}"]) == 0
     assert summary_of(tmp_path / "one")["results"]["absent"] == results["names"][elsewhere]["absent"]
 
 
 def test_preparing_alone_trains_nothing(rooms: Path, tmp_path: Path) -> None:
     words = f"teacher.words={rooms / 'words.safetensors'}"
-    arguments = ["train", str(rooms / "room_0"), words, f"out={tmp_path / 'out'}", "prepare_only=true", "quiet=true"]
-    assert cli.main(arguments) == 0
+    arguments = ["train", str(rooms / "room_0"), words, f"out={tmp_path / 'out'}", "prepare_only=true"]
+    assert cli.main([*arguments, "seeds.voxel=0.06", "quiet=true"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["out.prepared"]
 
 
@@ -159,7 +141,7 @@ def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(roo
     arguments = ["train", *scenes, "experiment=scannet", f"teacher.model={tmp_path / 'radio'}", "holdout=room_1"]
     # Processors without instructions for bfloat16 take two minutes for these steps.
     less = ["teacher.size=64", "train.steps=2", "train.warmup=1", "train.workers=0", "sampling.gaussians=60"]
-    less += ["train.precision=float32", "seeds.voxel=0.1"]
+    less += ["train.precision=float32", "seeds.voxel=0.3"]
     out = tmp_path / "scannet"
     assert cli.main([*arguments, *less, "tensorboard=false", f"out={out}", "quiet=true"]) == 0
     encoder, outputs, _ = load_weights(out / "encoder.safetensors")
@@ -170,14 +152,8 @@ def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(roo
 
 def test_a_sweep_trains_once_for_each_value(rooms: Path, tmp_path: Path) -> None:
     words = f"teacher.words={rooms / 'words.safetensors'}"
-    arguments = [
-        "train",
-        "-m",
-        str(rooms / "room_0"),
-        words,
-        f"prepared={tmp_path / 'prepared'}",
-        f"out={tmp_path / 'out'}",
-    ]
+    places = [f"prepared={tmp_path / 'prepared'}", f"out={tmp_path / 'out'}"]
+    arguments = ["train", "-m", str(rooms / "room_0"), words, *places]
     quick = [word for word in QUICK if not word.startswith("train.steps")]
     assert cli.main([*arguments, *quick, "tensorboard=false", "train.steps=1,2"]) == 0
     assert [summary_of(tmp_path / "out" / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
@@ -217,3 +193,97 @@ def test_a_signal_to_all_processes_of_a_training_leaves_a_checkpoint(rooms: Path
     assert running.returncode == 143, output
     assert "Traceback" not in output
     assert (tmp_path / "run.training" / "checkpoint.safetensors").is_file()
+
+
+@pytest.mark.usefixtures("no_gpu")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["holdout=kitchen_*"], "holdout: no scene is called 'kitchen_*'"),
+        (["holdout=room_*"], "matches every scene"),
+        (["model.transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry per level"),
+        (["teacher=radio"], "teacher.model= is missing"),
+        (["device=cuda"], "no GPU"),
+    ],
+)
+def test_a_training_that_cannot_be_is_refused_in_one_line(rooms, tmp_path, capsys, words, message):
+    table = [] if "teacher=radio" in words else [f"teacher.words={rooms / 'words.safetensors'}"]
+    assert message in refusal(
+        capsys, "train", str(rooms / "room_0"), str(rooms / "room_1"), *table, f"out={tmp_path / 'out'}", *words
+    )
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("no_gpu")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["weights=nowhere"], "weights: no file at nowhere"), (["encode.device=cuda"], "sees no GPU")],
+)
+def test_an_encoding_that_cannot_be_is_refused_in_one_line(rooms, trained, tmp_path, capsys, words, message):
+    options = [] if any(word.startswith("weights=") for word in words) else [f"weights={trained}"]
+    line = refusal(capsys, "encode", str(rooms / "room_2"), *options, f"out={tmp_path / 'out'}", *words)
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_features_of_another_space_are_not_judged_by_these_words(rooms, trained, tmp_path, capsys):
+    other = tmp_path / "other.safetensors"
+    table = load_text_table(rooms / "words.safetensors")
+    save_text_table(other, make_text_table(table.names, table.embeddings, "other-words"))
+    words = ["protocol=naming", f"weights={trained}", f"teacher.words={other}", f"out={tmp_path / 'out'}"]
+    line = refusal(capsys, "evaluate", str(rooms / "room_2"), *words)
+    assert "room-words" in line
+    assert "other-words" in line
+
+
+def test_two_scenes_of_one_name_and_one_scene_named_twice_are_refused(rooms, trained, tmp_path, capsys):
+    for name in ("a", "b"):
+        shutil.copytree(rooms / "room_0", tmp_path / name / "room")
+    both = [str(tmp_path / "a" / "room"), str(tmp_path / "b" / "room")]
+    problem = refusal(capsys, "encode", *both, f"weights={trained}", f"out={tmp_path / 'out'}")
+    assert "are both called 'room'" in problem
+    assert not (tmp_path / "out").exists()
+    twice = [str(rooms / "room_0"), str(rooms / "." / ".." / rooms.name / "room_0")]
+    problem = refusal(capsys, "encode", *twice, f"weights={trained}", f"out={tmp_path / 'out'}")
+    assert "is the same as" in problem
+    assert "give one of them" in problem
+    assert not (tmp_path / "out").exists()
+
+
+def test_weights_are_not_replaced_by_what_they_make(rooms, trained, tmp_path, capsys):
+    own = tmp_path / "encoder"
+    shutil.copytree(trained, own)
+    problem = refusal(capsys, "encode", str(rooms / "room_0"), f"weights={own}", f"out={own}", "overwrite=true")
+    assert "holds the input weights=" in problem
+    assert (own / "encoder.safetensors").is_file()
+
+
+def test_folders_that_a_training_did_not_make_are_left_alone(rooms, trained, tmp_path, capsys):
+    scenes = [str(rooms / f"room_{number}") for number in range(2)]
+    prepared = f"prepared={trained.with_name('encoder.prepared')}"
+    common = ["train", *scenes, f"teacher.words={rooms / 'words.safetensors'}", *QUICK[1:], "tensorboard=false"]
+    notes = tmp_path / "mine.training" / "notes.txt"
+    notes.parent.mkdir()
+    notes.touch()
+    for more in ((), ("resume=false",)):
+        assert "holds something else" in refusal(capsys, *common, prepared, f"out={tmp_path / 'mine'}", *more)
+    assert notes.is_file()
+    for inside in ("run", "run/prepared", "run.training", "run.training/prepared"):
+        problem = refusal(capsys, *common, f"prepared={tmp_path / inside}", f"out={tmp_path / 'run'}")
+        assert "give another folder" in problem
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.tex").touch()
+    problem = refusal(capsys, *common, f"prepared={foreign}", f"out={tmp_path / 'run'}")
+    assert "something else than prepared scenes" in problem
+    assert [path.name for path in foreign.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["model.transformer.encoder_depths=1,1,1,1,300000", "loss.cosine=0 loss.smooth_l1=0 loss.contrast_weight=0"],
+)
+def test_sizes_that_nobody_means_are_refused_before_the_work(rooms, tmp_path, capsys, setting):
+    problem = refusal(capsys, "train", str(rooms / "room_0"), *setting.split(), f"out={tmp_path / 'out'}")
+    assert setting.partition("=")[0].rpartition(".")[2] in problem
+    assert list(tmp_path.iterdir()) == []
