@@ -31,6 +31,9 @@ QUICK = (
     "train.log_every=2",
     "sampling.gaussians=600",
     "sampling.smallest=200",
-    "model.transformer.encoder_channels=[32,32,32,32,32]",
-    "model.transformer.decoder_channels=[32,32,32,32]",
+    "model.transformer.encoder_depths=[1,1]",
+    "model.transformer.encoder_channels=[32,32]",
+    "model.transformer.decoder_depths=[1]",
+    "model.transformer.decoder_channels=[32]",
+    "seeds.voxel=0.06",
 )

@@ -11,6 +11,21 @@ from gsencoder.types.features import Scoring
 TEMPERATURE = {"centered": 0.05, "cosine": 0.05, "dot": 1.0}
 
 
+def make_bank(components: np.ndarray, mean: np.ndarray, space: FeatureSpace, cosine: float = 1.0) -> MemoryBank:
+    """A bank whose components lie in the first cell of the first view."""
+    count = len(components)
+    return MemoryBank(
+        components=components.astype(np.float32),
+        sources=np.zeros((count, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (count, 1, 1)),
+        mean=mean,
+        threshold=0.9,
+        coverage=1.0,
+        cosine=cosine,
+        space=space,
+    )
+
+
 def make_memory(
     scoring: Scoring = "centered", *, components: int = 70, channels: int = 24, width: int = 6, gaussians: int = 200
 ) -> QueryMemory:
@@ -22,16 +37,7 @@ def make_memory(
     weights[::7] = 0
     queries = rng.normal(size=(gaussians, width)).astype(np.float32)
     queries[weights == 0] = 0
-    bank = MemoryBank(
-        components=raw,
-        sources=np.zeros((components, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (components, 1, 1)),
-        mean=mean if scoring == "centered" else np.zeros_like(mean),
-        threshold=0.9,
-        coverage=1.0,
-        cosine=0.95,
-        space=space,
-    )
+    bank = make_bank(raw, mean if scoring == "centered" else np.zeros_like(mean), space, cosine=0.95)
     return QueryMemory(
         queries=queries,
         weights=weights,

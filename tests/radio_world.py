@@ -7,7 +7,7 @@ from radios import small_joint_model, small_radio
 from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 
-SEEDS = ("seeds.voxel=0.06",)
+SEEDS = ("seeds.voxel=0.12",)
 QUICK = (
     "quiet=true",
     "tensorboard=false",
@@ -21,8 +21,8 @@ QUICK = (
     "train.warmup=1",
     "train.log_every=1",
     "sampling.views=1",
-    "sampling.gaussians=1000",
-    "sampling.smallest=200",
+    "sampling.gaussians=400",
+    "sampling.smallest=100",
 )
 
 

@@ -11,7 +11,7 @@ SHELLS = ViewsConfig(source="shells", candidates=16, count=6, width=160, height=
 
 
 def cube_in_room(*others: np.ndarray) -> tuple[Scene, Target]:
-    scene, rows = room(*others, step=0.09)
+    scene, rows = room(*others, step=0.12)
     return scene, target_of("cube", scene.gaussians, rows)
 
 

@@ -2,30 +2,24 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from shutil import copytree
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from memory_samples import memory_of_features
+from command_runs import results_of
+from memory_samples import make_bank, memory_of_features
 from named_rooms import write_words
 from rooms import room
 
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.benchmarks.grounding import (
-    GroundingProtocol,
-    ground_scene,
-    ids_by_name,
-    masks_of,
-)
+from gsencoder.evaluate.benchmarks.grounding import GroundingProtocol, ground_scene, ids_by_name, masks_of
 from gsencoder.evaluate.benchmarks.protocol import Evaluation, predict_scenes
 from gsencoder.render import blend
 from gsencoder.text.table import make_text_table
-from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, Scene, SceneObject, Views
+from gsencoder.types import FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
 
 
 def thing(number: int, name: str | None, *, placed: bool = True) -> SceneObject:
@@ -47,7 +41,6 @@ def test_instances_of_one_name_are_one_mask_and_small_ones_are_counted() -> None
 def labeled_room() -> tuple[Scene, GaussianFeatures]:
     """A room in which the cube is a mug; features are the words, exactly."""
     scene, cube = room()
-    assert scene.gaussians is not None
     which = torch.zeros(len(scene.gaussians))
     which[cube] = 1
     cameras = scene.views.cameras
@@ -82,17 +75,7 @@ def test_what_features_say_exactly_is_grounded_exactly() -> None:
 
 def test_a_memory_is_grounded_by_what_pixels_attend_to_and_rays_that_meet_nothing_answer_no_word() -> None:
     scene, features = labeled_room()
-    bank = MemoryBank(
-        components=np.eye(2, dtype=np.float32),
-        sources=np.zeros((2, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (2, 1, 1)),
-        mean=features.mean,
-        threshold=1.0,
-        coverage=1.0,
-        cosine=1.0,
-        space=features.space,
-    )
-    memory = memory_of_features(features, bank, channels=1)
+    memory = memory_of_features(features, make_bank(np.eye(2), features.mean, features.space), channels=1)
     protocol = GroundingProtocol(min_pixels=5)
     plain, attended = (ground_scene(scene, features, WORDS, protocol, memory=each)[0] for each in (None, memory))
     assert [(a.view, a.phrase) for a in plain] == [(b.view, b.phrase) for b in attended]
@@ -127,11 +110,6 @@ def test_scenes_without_labels_and_words_of_other_spaces_are_refused() -> None:
     other = make_text_table(["wall", "mug"], np.eye(2, dtype=np.float32), "others")
     with pytest.raises(InputError, match="use the text encoder 'words'"):
         ground_scene(scene, features, other)
-
-
-def results_of(folder: Path) -> dict[str, Any]:
-    results: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
-    return results
 
 
 @pytest.mark.slow

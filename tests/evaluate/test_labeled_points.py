@@ -61,7 +61,6 @@ def test_a_gaussian_is_of_the_listed_object_on_whose_pixels_it_is_seen() -> None
 
 def test_without_sensor_depth_what_is_behind_counts_and_pixels_of_all_views_add_up() -> None:
     scene = laid_out(views=2)
-    assert scene.views is not None
     assert labeled_points(scene).objects[FAINT] == MUG
     bare = labeled_points(replace(scene, views=replace(scene.views, depths=None)))
     assert bare.objects.tolist() == [MUG, NAMELESS, 0, 0, MUG, MUG]
@@ -102,7 +101,6 @@ def test_the_distance_to_a_vertex_is_in_metres(unit: float | None, near: bool) -
 
 def test_scenes_without_gaussians_or_true_objects_are_refused() -> None:
     scene = laid_out()
-    assert scene.views is not None
     with pytest.raises(InputError, match="scene made has no Gaussians"):
         labeled_points(replace(scene, gaussians=None))
     for broken in (

@@ -29,14 +29,8 @@ def test_the_figures_of_the_paper_are_those_that_it_prints() -> None:
         return dict(next(each.values for each in published_rows(table) if each.method == method))
 
     fused = "SplatDistill, fused"
-    assert row("splatdistill_2_instances", fused) == {
-        "ap_25": 28.1,
-        "ap_50": 24.3,
-        "ap": 19.1,
-        "ap_head": 22.6,
-        "ap_common": 18.6,
-        "ap_tail": 11.1,
-    }
+    figures = {"ap_25": 28.1, "ap_50": 24.3, "ap": 19.1, "ap_head": 22.6, "ap_common": 18.6, "ap_tail": 11.1}
+    assert row("splatdistill_2_instances", fused) == figures
     assert row("splatdistill_3_answers", fused)["em_refined"] == 42.1
     assert "bleu_4" not in row("splatdistill_3_answers", fused)
     assert row("splatdistill_1_recognition", "SplatDistill, distilled")["sink"] == 100.0

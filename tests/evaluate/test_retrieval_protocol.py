@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_runs import refusal, results_of
-from memory_samples import memory_of_features
+from memory_samples import make_bank, memory_of_features
 from named_rooms import write_words
 from rooms import room
 
@@ -20,14 +20,13 @@ from gsencoder.infer.relevancy import word_directions
 from gsencoder.memory.attention import render_queries
 from gsencoder.render import blend
 from gsencoder.text.table import load_text_table
-from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
 TEXTS = np.random.default_rng(1).normal(size=(70, 3)).astype(np.float32)
 
 
 def featured() -> tuple[Scene, GaussianFeatures]:
     scene, cube = room()
-    assert scene.gaussians is not None
     which = torch.zeros(len(scene.gaussians), dtype=torch.long)
     which[cube] = 1
     values = np.array([[1.0, 0.2, 0.0], [0.0, 1.0, 0.5]], np.float32)[which.numpy()]
@@ -40,7 +39,6 @@ def featured() -> tuple[Scene, GaussianFeatures]:
 @pytest.mark.parametrize("mode", ["centered", "raw"])
 def test_scores_are_pooled_cosines_of_rendered_pixels(pooling: Any, mode: Any) -> None:
     scene, features = featured()
-    assert scene.gaussians is not None
     protocol = RetrievalProtocol(pooling=pooling, mode=mode)
     text_mean = TEXTS.mean(axis=0)
     directions = word_directions(TEXTS, text_mean, mode)
@@ -62,18 +60,8 @@ def test_scores_are_pooled_cosines_of_rendered_pixels(pooling: Any, mode: Any) -
 def test_a_memory_is_scored_by_what_pixels_attend_to() -> None:
     scene, features = featured()
     rows = np.unique(features.features, axis=0)
-    bank = MemoryBank(
-        components=(rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32),
-        sources=np.zeros((2, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (2, 1, 1)),
-        mean=features.mean,
-        threshold=1.0,
-        coverage=1.0,
-        cosine=1.0,
-        space=features.space,
-    )
+    bank = make_bank(rows / np.linalg.norm(rows, axis=1, keepdims=True), features.mean, features.space)
     memory = memory_of_features(features, bank, channels=2)
-    assert scene.gaussians is not None
     directions = word_directions(TEXTS, TEXTS.mean(axis=0), "raw")
     protocol = RetrievalProtocol(mode="raw", pooling="mean")
     (scores,) = score_views(scene, features, [1], directions, protocol, memory=memory)

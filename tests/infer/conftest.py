@@ -1,10 +1,13 @@
 """An encoder that is small, and what it was exported to."""
 
+import fcntl
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from symbolic import symbolic_sizes
@@ -52,10 +55,18 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def lowered(weights: Path) -> Any:
-    """The encoder as a graph whose convolutions are still one operator each, which takes as long as all else."""
-    with symbolic_sizes():
-        return TorchNetwork.load(str(weights)).lower()
+def lowered(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The encoder as a graph whose convolutions are still one operator each, made by one of all processes of tests."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    file = folder / "lowered.onnx"
+    with open(folder / "lowered.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not file.exists():
+            with symbolic_sizes():
+                onnx.save(TorchNetwork.load(str(weights)).lower(), file)
+    return onnx.load(file)
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,7 @@ from gsencoder.memory.bank import BankConfig
 from gsencoder.render import blend
 from gsencoder.render.images import render_image
 from gsencoder.train.memory import MemoryConfig, untrained_memory
-from gsencoder.types import MemoryBank, QueryMemory, Scene
+from gsencoder.types import QueryMemory, Scene
 
 GREY = np.full((60, 80, 3), 90, np.uint8)
 
@@ -203,14 +203,6 @@ def test_a_picture_holds_the_view_and_the_photographs_of_the_components_with_the
         assert title.endswith(f" of {names[source]}{ending}")
 
 
-def test_banks_of_one_component_are_drawn(memory: QueryMemory, scene: Scene) -> None:
-    rendered = attention_picture(memory, scene, 0, (24, 20))
-    assert in_color(rendered, MARK).any()
-    single = attention_picture(first_components(memory, 1), scene, 0, (24, 20))
-    assert single.shape[1] < rendered.shape[1]
-    assert in_color(single, MARK).any()
-
-
 def test_entropy_is_none_for_one_component_and_largest_for_equal_ones() -> None:
     weights = np.array([[1, 0, 0, 0], [0.25] * 4, [0.5, 0.5, 0, 0]], np.float32)
     np.testing.assert_allclose(attention_entropy(weights), [0, np.log(4), np.log(2)], atol=1e-6)
@@ -250,41 +242,3 @@ def test_evenly_spaced_views_are_drawn_and_those_that_show_nothing_are_named(mem
     turned = replace(scene, views=replace(scene.views, cameras=replace(scene.views.cameras, cam_from_world=away)))
     with pytest.warns(SceneWarning, match="view far shows no Gaussian with a query and is not drawn"):
         assert [view for view, _ in attention_pictures(memory, turned, views=2)] == [0]
-
-
-def test_features_of_one_channel_are_drawn(scene: Scene) -> None:
-    one = make_memory("dot", components=2, channels=1, width=1, gaussians=len(scene.gaussians))
-    picture = attention_picture(one, scene, 0, (24, 20))
-    assert in_color(picture, MARK).any()
-
-
-def test_sources_of_the_walls_bank_are_cells_of_two_pixels(memory: QueryMemory) -> None:
-    bank: MemoryBank = memory.bank
-    expected = np.stack(
-        [bank.sources[:, 2], bank.sources[:, 1], bank.sources[:, 2] + 1, bank.sources[:, 1] + 1], axis=1
-    )
-    np.testing.assert_allclose(bank.cells, 2 * expected)
-
-
-@pytest.mark.parametrize("case", ["haze", "below the middle", "beside the middle"])
-def test_the_salient_pixel_is_opaque_and_in_the_middle_though_others_attend_to_less(memory, case):
-    """One Gaussian in the middle attends to all components, and another one to a single component."""
-    scene = wall(0)
-    positions = {"haze": (0.4, 0.0, 3.0), "below the middle": (0.0, 0.95, 3.0), "beside the middle": (1.1, 0.0, 3.0)}[
-        case
-    ]
-    gaussians = replace(
-        scene.gaussians.select(np.zeros(2, int)),
-        means=np.array([(0, 0, 3), positions], np.float32),
-        scales=np.full((2, 3), 0.1, np.float32),
-        opacities=np.array([0.95, 0.4 if case == "haze" else 0.95], np.float32),
-    )
-    toward = np.linalg.lstsq(memory.projection.T, memory.bank.components[0] - memory.mean, rcond=None)[0]
-    queries = np.stack([np.zeros(5), toward]).astype(np.float32)
-    two = replace(memory, queries=queries, weights=np.ones(2, np.float32))
-    both, one = attention_entropy(two.attention(queries))
-    assert one < both - 0.1
-    b = blend(gaussians, scene.views.cameras, 0)
-    pixel = salient_pixel(two, b)
-    assert abs(pixel[0] - 24) <= 4
-    assert abs(pixel[1] - 20) <= 4

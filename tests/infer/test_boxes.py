@@ -56,11 +56,6 @@ def test_the_spacing_of_a_sample_does_not_depend_on_order(rng, monkeypatch):
     assert sampled == pytest.approx(whole, rel=0.1)
 
 
-@pytest.mark.parametrize("count", [0, 1, 5])
-def test_points_in_one_place_have_no_spacing(count: int) -> None:
-    assert scene_spacing(np.full((count, 3), 1.5, np.float32)) == 0
-
-
 def test_clusters_on_the_grid_are_those_of_dbscan_on_a_surface(rng, monkeypatch):
     centers = rng.random((30, 3)) * 4
     points = (centers[rng.integers(0, 30, 6000)] + rng.normal(0, 0.03, (6000, 3))).astype(np.float32)
@@ -145,15 +140,6 @@ def test_points_on_a_line_have_a_box_along_it() -> None:
     box = bounds(points)
     np.testing.assert_allclose(np.sort(box.size), [0, 0, 3], atol=1e-5)
     assert abs(box.rotation[:, box.size.argmax()] @ direction) == pytest.approx(1)
-
-
-def test_one_two_and_three_points_have_boxes() -> None:
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], np.float32)
-    assert bounds(points[:1]).size.tolist() == [0, 0, 0]
-    np.testing.assert_allclose(np.sort(bounds(points[:2]).size), [0, 0, 1], atol=1e-7)
-    area = np.sort(bounds(points).size)
-    assert area[0] == pytest.approx(0, abs=1e-7)
-    assert area[1] * area[2] <= 2 + 1e-6
 
 
 def test_sigma_boxes_bound_the_ellipsoids(rng: np.random.Generator) -> None:

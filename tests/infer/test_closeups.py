@@ -1,6 +1,7 @@
 """Close-ups: windows of photographs, as they were taken, that show small targets large."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ WIDTH, HEIGHT = 1280, 960
 SIZE = {"width": 320, "height": 240}
 
 
+@cache
 def photographed() -> tuple[Scene, Target]:
     """The room with small cameras and large photographs, whose red and green say where a pixel is."""
     scene, rows = room(step=0.12)

@@ -4,17 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from memory_samples import make_memory
+from memory_samples import make_bank, make_memory
 from sklearn.decomposition import PCA
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.memory_pictures import (
-    UMAP_LEAST,
-    _title,
-    component_scatter,
-    principal_plane,
-    umap_plane,
-)
+from gsencoder.infer.memory_pictures import UMAP_LEAST, component_scatter, principal_plane, umap_plane
 from gsencoder.memory.bank import RawSample
 from gsencoder.types import FeatureSpace, MemoryBank
 
@@ -30,17 +24,8 @@ def blue(picture: np.ndarray) -> np.ndarray:
 
 
 def bank_of(components: np.ndarray) -> MemoryBank:
-    count, channels = components.shape
-    return MemoryBank(
-        components=components.astype(np.float32),
-        sources=np.zeros((count, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (count, 1, 1)),
-        mean=np.zeros(channels, np.float32),
-        threshold=0.9,
-        coverage=0.987,
-        cosine=0.95,
-        space=FeatureSpace(name="toy", channels=channels),
-    )
+    channels = components.shape[1]
+    return make_bank(components, np.zeros(channels, np.float32), FeatureSpace(name="toy", channels=channels))
 
 
 def sample_of(features: np.ndarray, total: int | None = None) -> RawSample:
@@ -97,16 +82,6 @@ def test_a_dot_lies_where_its_coordinates_are() -> None:
     assert np.nonzero(red(left))[1].mean() < middle < np.nonzero(red(right))[1].mean()
 
 
-def test_the_title_states_how_many_features_are_drawn_and_how_many_are_covered() -> None:
-    bank = bank_of(np.eye(3))
-    assert _title(bank, sample_of(np.ones((40, 3)), 5000)) == [
-        "toy",
-        "3 components for 5,000 raw features, of which 40 are drawn",
-        "98.7 % of the raw features have a component within the threshold, a cosine of 0.900",
-    ]
-    assert _title(bank_of(np.eye(1, 3)), sample_of(np.ones((1, 3))))[1] == "1 component for 1 raw feature"
-
-
 def test_umap_is_given_the_directions_that_the_bank_compares_and_its_dots_are_told_apart(monkeypatch):
     rng = np.random.default_rng(0)
     mean = np.array([5, 0, 0, 0], np.float32)
@@ -145,14 +120,6 @@ def test_tiny_banks_and_features_without_variance_are_drawn(components: np.ndarr
 def test_features_of_another_teacher_are_refused() -> None:
     with pytest.raises(InputError, match="raw features of 5 channels and components of 24"):
         component_scatter(make_memory().bank, sample_of(np.ones((3, 5))))
-
-
-def test_a_name_that_is_longer_than_the_picture_is_cut() -> None:
-    bank = bank_of(np.eye(3))
-    long = replace(bank, space=replace(bank.space, name="name " * 60))
-    picture = component_scatter(long, sample_of(np.eye(3)))
-    assert picture.shape == component_scatter(bank, sample_of(np.eye(3))).shape
-    assert (picture[:20, [0, 1, -2, -1]] == 255).all()
 
 
 def test_umap_says_what_to_install_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -262,11 +262,6 @@ def test_a_rerun_gives_the_same_bits() -> None:
     assert np.array_equal(encode(one, encoder(), config).features, encode(one, encoder(), config).features)
 
 
-def test_an_empty_splat_is_refused() -> None:
-    with pytest.raises(InputError, match="no Gaussians"):
-        encode(random_gaussians(0), encoder(), WHOLE)
-
-
 @pytest.mark.parametrize("unit", [0.0, float("nan")])
 def test_a_unit_that_is_not_positive_is_refused(unit: float) -> None:
     with pytest.raises(InputError, match="metres_per_unit: expected a positive number of metres"):

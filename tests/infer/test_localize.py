@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rooms import splat
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer import localize as module
 from gsencoder.infer.draw import EDGES, box_corners, write_boxes_ply
-from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize, spacing_of
+from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
 from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.text.table import TextTable, make_text_table
-from gsencoder.types import Box, FeatureBasis, GaussianFeatures, Gaussians, Localization, Scene
+from gsencoder.types import Box, FeatureBasis, GaussianFeatures, Localization, Scene
 
 WORDS = ("mug", "chair", "lamp", "spoon", "rug", "door")
 PLACES = {"mug": [(0.5, 0.5, 0.8)], "chair": [(2, 0.5, 0.4), (2, 2, 0.4), (0.5, 2.5, 0.4)], "lamp": [(3, 3, 1.2)]}
@@ -50,13 +51,6 @@ def make_room_scene(*, basis: bool = False, origin: tuple[float, float, float] =
     weights = np.ones(len(means), np.float32)
     weights[:50] = 0
     features[:50] = 0
-    gaussians = Gaussians(
-        means=means,
-        quats=np.tile(np.float32([1, 0, 0, 0]), (len(means), 1)),
-        scales=np.full((len(means), 3), 0.01, np.float32),
-        opacities=np.ones(len(means), np.float32),
-        sh=np.zeros((len(means), 1, 3), np.float32),
-    )
     space, stored_basis = replace(TABLE.space, teacher="labels"), None
     if basis:
         rows = np.linalg.svd(np.unique(features[50:], axis=0) - TABLE.mean, full_matrices=False)[2][:4]
@@ -64,7 +58,9 @@ def make_room_scene(*, basis: bool = False, origin: tuple[float, float, float] =
         features = ((features - TABLE.mean) @ rows.T).astype(np.float32) * (weights > 0)[:, None]
     fused = GaussianFeatures(features=features, weights=weights, mean=TABLE.mean, space=space, basis=stored_basis)
     up = np.array([0.0, 0, 1])
-    return Scene(name="room", gaussians=gaussians, features={"toy": fused}, origin=np.array(origin, float), up=up)
+    return Scene(
+        name="room", gaussians=splat(means, 0.01), features={"toy": fused}, origin=np.array(origin, float), up=up
+    )
 
 
 SCENE = make_room_scene()
@@ -98,15 +94,6 @@ def test_words_asked_together_are_found_as_they_are_one_by_one() -> None:
     together = localize(SCENE, ["mug", "chair", "lamp"], TABLE)
     alone = [box for word in together.queries for box in localize(SCENE, [word], TABLE).boxes]
     assert localization_to_json(together) == localization_to_json(replace(together, boxes=tuple(alone)))
-
-
-def test_a_spacing_that_was_computed_before_gives_the_same_boxes() -> None:
-    assert SCENE.gaussians is not None
-    known = spacing_of(SCENE.gaussians)
-    assert known == pytest.approx(STEP, rel=1e-5)
-    for config in (LocalizeConfig(), LocalizeConfig(eps_spacings=2.0)):
-        ours, theirs = (localize(SCENE, ["mug", "chair"], TABLE, config, spacing=each) for each in (known, None))
-        assert localization_to_json(ours) == localization_to_json(theirs)
 
 
 def test_the_order_of_the_gaussians_does_not_matter(rng: np.random.Generator) -> None:
@@ -216,13 +203,9 @@ def test_json_holds_what_the_boxes_hold() -> None:
     for one, box in zip(listed, localization.boxes, strict=True):
         assert one["count"] == len(box.rows)
         assert one["aabb_min"] == box.aabb_min.tolist()
-        turn, size = np.array(one["obb"]["rotation"]), np.array(one["obb"]["size"])
-        corners = (
-            one["obb"]["center"]
-            + (np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2 * size) @ turn.T
-        )
-        assert (corners.min(axis=0) <= box.center).all()
-        assert (corners.max(axis=0) >= box.center).all()
+        assert one["obb"]["rotation"] == box.obb_rotation.tolist()
+        assert one["obb"]["center"] == box.obb_center.tolist()
+        assert one["obb"]["size"] == box.obb_size.tolist()
 
 
 def test_the_ply_of_boxes_opens_in_other_programs_with_all_its_points(tmp_path: Path, open3d: Any) -> None:
@@ -247,16 +230,9 @@ def test_the_edges_of_a_box_are_its_twelve_sides() -> None:
 
 
 def test_no_boxes_make_an_empty_ply(tmp_path: Path) -> None:
-    empty = Localization(
-        queries=("mug",),
-        relevancy=np.zeros((1, 0), np.float32),
-        thresholds=np.zeros(1, np.float32),
-        probabilities=np.zeros(1, np.float32),
-        boxes=(),
-    )
-    write_boxes_ply(tmp_path / "none.ply", Scene(name="x"), empty)
-    assert b"element vertex 0\n" in (tmp_path / "none.ply").read_bytes()
     localization = localize(SCENE, ["mug"], TABLE)
+    write_boxes_ply(tmp_path / "none.ply", Scene(name="x"), replace(localization, boxes=()))
+    assert b"element vertex 0\n" in (tmp_path / "none.ply").read_bytes()
     with pytest.raises(InputError, match="of 0 Gaussians"):
         write_boxes_ply(tmp_path / "wrong.ply", Scene(name="x"), localization)
     assert not (tmp_path / "wrong.ply").exists()

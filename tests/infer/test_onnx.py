@@ -77,10 +77,9 @@ def test_borders_of_cells_are_where_torch_has_them(both: tuple[Encoder, Encoder]
     assert apart(*both, moved(cloud, on_borders / np.float32(0.3048)), unit=0.3048) < TOLERANCE
 
 
-@pytest.mark.parametrize("chunk", [200])
-def test_parts_are_cut_as_torch_cuts_them(both: tuple[Encoder, Encoder], chunk: int) -> None:
-    cloud = random_cloud(3000, 0.05)
-    config = EncodeConfig(chunk=chunk, halo=0.2, precision="float32", device="cpu")
+def test_parts_are_cut_as_torch_cuts_them(both: tuple[Encoder, Encoder]) -> None:
+    cloud = random_cloud(1500, 0.05)
+    config = EncodeConfig(chunk=200, halo=0.2, precision="float32", device="cpu")
     ours, parts = (each.encode(cloud, config).features for each in both)
     assert np.abs(ours - parts).max() / np.abs(parts).max() < TOLERANCE
     assert not np.array_equal(both[1].encode(cloud, ALONE).features, parts)
@@ -100,13 +99,10 @@ def test_rooms_that_are_far_apart_have_the_bits_that_each_has_alone(both: tuple[
 
 def test_a_rerun_gives_the_same_bits_on_any_number_of_threads(folder: Path) -> None:
     cloud = random_cloud(4000, 0.05)
-    encoded = [
-        Encoder(OnnxNetwork(folder / "encoder.onnx", threads=threads)).encode(cloud, ALONE).features
-        for threads in (1, 2)
-    ]
-    for features in encoded:
-        again = Encoder(OnnxNetwork(folder / "encoder.onnx", threads=2)).encode(cloud, ALONE).features
-        np.testing.assert_array_equal(features, again)
+    networks = [OnnxNetwork(folder / "encoder.onnx", threads=threads) for threads in (1, 2)]
+    one, two, again = (Encoder(network).encode(cloud, ALONE).features for network in (*networks, networks[1]))
+    np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(two, again)
 
 
 def test_the_graph_alone_takes_five_arrays_of_a_splat_in_metres(folder: Path, both: tuple[Encoder, Encoder]) -> None:
@@ -158,12 +154,9 @@ def deflated(raw: bytes) -> str:
         ),
         (lambda header: {KEY: "{"}, "is damaged"),
         (lambda header: changed(header, "version", 1), "format version 1, and this gsencoder reads 2"),
-        (lambda header: changed(header, "levels", 0), "1 to 7 levels"),
         (lambda header: changed(header, "voxel", -1), "positive voxel"),
-        (lambda header: changed(header, "voxel", None), "damaged"),
         (lambda header: changed(header, "orders", ["spiral"]), "expected orders among"),
         (lambda header: changed(header, "space", {"name": "x"}), "damaged"),
-        (lambda header: changed(header, "arrays", {}), "damaged"),
         (
             lambda header: changed(header, "arrays", {"mean": {"dtype": "object", "shape": [6]}}),
             "float32, float16 or int8",
@@ -239,13 +232,13 @@ def test_what_cannot_be_encoded_is_refused_on_both_sides_alike(both: tuple[Encod
 
 
 @pytest.mark.usefixtures("no_jaxtyping")
-@pytest.mark.parametrize("count", [1, 2, 3, 8, 1023, 1024, 1025, 2**16 + 1])
+@pytest.mark.parametrize("count", [1, 2, 3, 1023, 1024, 1025])
 def test_the_search_counts_what_is_below(count: int) -> None:
     keys = np.sort(np.random.default_rng(count).integers(0, 2**62, count))
     wanted = np.unique(np.concatenate((keys[:50], keys[-50:] + 1, keys[:50] - 1, [0, 2**62])))
-    for more, side in ((0, "left"), (1, "right")):
-        counts = search(keys, wanted, np.array(more))
-        np.testing.assert_array_equal(np.asarray(counts), np.searchsorted(keys, wanted, side))
+    left, right = np.split(np.asarray(search(keys, np.tile(wanted, 2), np.repeat([0, 1], len(wanted)))), 2)
+    np.testing.assert_array_equal(left, np.searchsorted(keys, wanted, "left"))
+    np.testing.assert_array_equal(right, np.searchsorted(keys, wanted, "right"))
 
 
 def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[Encoder, Encoder]) -> None:

@@ -1,7 +1,7 @@
 """What `export` says and refuses, and its file in an interpreter that has no torch."""
 
 import json
-import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,11 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from torch import nn
 
 from gsencoder.app import main as cli
 from gsencoder.data.splats.files import save_splat
-from gsencoder.infer.encode import TOLERANCE
+from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, save_heads
+from gsencoder.infer.encode import TOLERANCE, load_encoder
 from gsencoder.infer.onnx.export import random_cloud
+from gsencoder.infer.torch_network import TorchNetwork
+from gsencoder.teachers.base import Head
 
 pytestmark = pytest.mark.slow
 
@@ -51,8 +55,13 @@ def test_the_command_refuses_before_it_begins(words, message, tmp_path, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["taken.onnx"]
 
 
-def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_path: Path) -> None:
-    save_splat(tmp_path / "room.ply", random_cloud(500, 0.05))
+def test_words_are_found_in_an_interpreter_that_has_no_torch_and_by_the_example(folder: Path, tmp_path: Path) -> None:
+    cloud = random_cloud(2000, 0.05)
+    # Half of the sheet is white and the other black, so that even an untrained encoder tells them apart.
+    left = cloud.means[:, :1] < 0
+    save_splat(tmp_path / "room.ply", replace(cloud, sh=np.where(left, 1.5, -1.5).repeat(3, 1)[:, None].astype("f4")))
+    example = Path(__file__).parents[2] / "examples" / "05_onnx_without_torch.py"
+    assert len(example.read_text().splitlines()) <= 30
     code = (
         "import sys\n"
         "class NoTorch:\n"
@@ -68,25 +77,31 @@ def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_p
         "from gsencoder.infer.encode import Encoder\n"
         "scene = load_features(__import__('pathlib').Path(out) / 'features')\n"
         "assert len(localize(scene, ['mugs'], Encoder.load(weights).words).boxes) > 0\n"
+        "import runpy\n"
+        "for word in ('mug', 'unicorn'):\n"
+        "    sys.argv = ['example', weights, splat, word]\n"
+        f"    runpy.run_path({str(example)!r}, run_name='__main__')\n"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 1, done.stderr
+    assert "\nmug at [" in done.stdout
+    assert done.stderr.splitlines()[-1].startswith("error: not among the 3 words of words-6: 'unicorn'")
 
 
-def test_the_example_answers_a_word_for_a_splat_without_torch(folder: Path, tmp_path: Path) -> None:
-    cloud = random_cloud(2000, 0.05)
-    # Half of the sheet is white and the other black, so that even an untrained encoder tells them apart.
-    left = cloud.means[:, :1] < 0
-    save_splat(tmp_path / "room.ply", replace(cloud, sh=np.where(left, 1.5, -1.5).repeat(3, 1)[:, None].astype("f4")))
-    example = Path(__file__).parents[2] / "examples" / "05_onnx_without_torch.py"
-    text = example.read_text()
-    assert len(text.splitlines()) <= 30
-    (tmp_path / "torch.py").write_text("raise ModuleNotFoundError('no torch here')")
-    for word, code in (("mug", 0), ("unicorn", 1)):
-        words = [sys.executable, example, folder / "encoder.onnx", tmp_path / "room.ply", word]
-        done = subprocess.run(words, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
-        assert done.returncode == code, done.stderr
-        if code:
-            assert done.stderr.startswith("error: not among the 3 words of words-6: 'unicorn'")
-        else:
-            assert done.stdout.startswith("mug at [")
+def test_an_exported_encoder_carries_its_heads(weights, lowered, tmp_path, monkeypatch):
+    monkeypatch.setattr(TorchNetwork, "lower", lambda _: lowered)
+    shutil.copytree(weights, tmp_path / "encoder")
+    head = Head(name="siglip.summary", body=nn.Sequential(nn.Linear(6, 4)))
+    heads = HeadSet(
+        space=load_encoder(str(weights)).spaces["labels"],
+        heads=(MeasuredHead(head=head, mean=np.zeros(4, np.float32), scale=1.0, cells=1, cosine=1.0, worst=1.0),),
+    )
+    beside = tmp_path / "encoder" / "heads.safetensors"
+    save_heads(beside, heads)
+    graph = tmp_path / "e.onnx"
+    assert cli.main(["export", f"weights={beside.parent}", "sizes=[1]", f"out={graph}", "quiet=true"]) == 0
+    assert (tmp_path / "e.onnx.heads.safetensors").read_bytes() == beside.read_bytes()
+    save_splat(tmp_path / "room.ply", random_cloud(50, 0.05))
+    out = tmp_path / "features"
+    assert cli.main(["encode", str(tmp_path / "room.ply"), f"weights={graph}", f"out={out}", "quiet=true"]) == 0
+    assert (out / "heads.safetensors").read_bytes() == beside.read_bytes()

@@ -28,12 +28,15 @@ SHAPE = TransformerConfig(
     decoder_channels=(),
     head_channels=8,
     patch=24,
+    orders=("hilbert",),
 )
 ALONE = EncodeConfig(chunk=0, precision="float32", device="cpu")
 
 
 @pytest.mark.slow
-def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights: Path, tmp_path: Path) -> None:
+def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does_and_nearly_in_cheaper_precisions(
+    weights: Path, tmp_path: Path
+) -> None:
     first = Encoder.load(str(weights)).outputs.select()
     mean = np.arange(3, dtype=np.float32) / 10
     second = OutputSpace(space=FeatureSpace(name="three", channels=3), mean=mean, scale=5.0)
@@ -48,11 +51,16 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights
     header = encoder.network.header
     clouds = [Cloud(f"{count}", random_cloud(count, encoder.voxel, seed=count)) for count in (1, 300, 2000)]
     with symbolic_sizes():
-        lowered = encoder.network.lower()
+        lowered, half = encoder.network.lower(), encoder.network.lower(half=True)
     model = export_onnx(header, lowered)
     assert max(check_parity(model, encoder, clouds).values()) < 1e-4
     for precision in ("int8_weights", "int8_dynamic"):
         check_cosines(export_onnx(replace(header, precision=precision), lowered), model, clouds[1:], cosine=0.98)
+    halved = export_onnx(replace(header, precision="float16"), half)
+    assert len(halved) < 0.8 * len(model)
+    assert max(check_cosines(halved, model, clouds[1:], cosine=0.99999).values()) < 1 - 1e-9
+    with pytest.raises(InputError, match="the model computes in float16, not float32"):
+        Encoder(OnnxNetwork(halved, device="cpu")).encode(clouds[1].gaussians, ALONE, space="colors")
     runtime = Encoder(OnnxNetwork(model, device="cpu"))
     assert set(runtime.spaces) == {"labels", "colors", "raw"}
     assert set(runtime.tables) == {"labels"}

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from jaxtyping import Float32
+from rooms import splat
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer import localize as module
@@ -33,7 +34,7 @@ from gsencoder.infer.relevancy import (
     relevancy,
 )
 from gsencoder.text.table import TextEncoder, TextTable, make_text_table
-from gsencoder.types import FeatureBasis, GaussianFeatures, Gaussians, Localization, Scene
+from gsencoder.types import FeatureBasis, GaussianFeatures, Localization, Scene
 
 WORDS = ("mug", "cup", "chair", "lamp", "spoon")
 EVERYTHING = LocalizeConfig(min_probability=0.0)
@@ -84,14 +85,7 @@ def make_scene(strength: float = 1.0, *, basis: bool = False) -> Scene:
         stored_basis = FeatureBasis(mean=TABLE.mean, components=rows, energy_kept=1.0, space=space)
         features = ((features - TABLE.mean) @ rows.T).astype(np.float32)
     fused = GaussianFeatures(features=features, weights=weights, mean=TABLE.mean, space=space, basis=stored_basis)
-    gaussians = Gaussians(
-        means=means,
-        quats=np.tile(np.float32([1, 0, 0, 0]), (len(means), 1)),
-        scales=np.full((len(means), 3), 0.01, np.float32),
-        opacities=np.ones(len(means), np.float32),
-        sh=np.zeros((len(means), 1, 3), np.float32),
-    )
-    return Scene(name="room", gaussians=gaussians, features={"toy": fused})
+    return Scene(name="room", gaussians=splat(means, 0.01), features={"toy": fused})
 
 
 SCENE = make_scene()

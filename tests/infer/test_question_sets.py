@@ -158,25 +158,6 @@ def described(number: int, scene: str = "a", name: str = "x", **changes: Any) ->
     return keys | {"token": ["d"]} | changes
 
 
-def test_the_meant_box_comes_first_and_the_others_in_their_order(tmp_path: Path) -> None:
-    (question,) = read(tmp_path, [described(4)]).questions
-    assert question.id == "a/4/0"
-    targets = [target(0), target(5), target(9)]
-    for mark, order in ((1, (0, 5, 9)), (2, (5, 0, 9)), (3, (9, 0, 5))):
-        (row,) = predictions("scanrefer", [(question, {"mark": mark, "targets": targets})])
-        assert (row["bbox"], row["bboxes"]) == (corners(order[0]), [corners(low) for low in order])
-        assert (row["scene_id"], row["object_id"], row["ann_id"]) == ("a", "4", "0")
-
-
-def test_answers_have_the_box_of_the_best_target_and_unanswered_descriptions_come_last(tmp_path: Path) -> None:
-    questions = read(tmp_path, [{"scene_id": "a", "question_id": "q", "question": "What?"}]).questions
-    (row,) = predictions("scanqa", [(questions[0], {"answer": "A.", "targets": [target(3), target(0)]})])
-    assert row == {"scene_id": "a", "question_id": "q", "answer_top10": ["a"], "bbox": corners(3)}
-    first, second = read(tmp_path, [described(1), described(2)]).questions
-    rows = predictions("scanrefer", [(second, {"mark": 1, "targets": [target(0)]})], [first])
-    assert [(each["object_id"], len(each["bboxes"])) for each in rows] == [("2", 1), ("1", 0)]
-
-
 def test_captions_of_scenes_keep_their_boxes_and_the_even_probabilities_of_eighteen_classes() -> None:
     keyed = caption_question("b", "7", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {"obj_prob": [0.5, 0.5]})
     bare = caption_question("a", "0", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {})

@@ -1,6 +1,7 @@
 """Relevancy against plain formulas on decoded features; thresholds at their ends."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,9 +56,7 @@ def test_relevancy_in_coordinates_is_the_cosine_of_decoded_vectors(rng: np.rando
 def test_a_mean_that_is_not_the_bases_own_is_removed_exactly(rng: np.random.Generator) -> None:
     features, text = in_basis(rng), words(rng)
     other = rng.normal(size=24).astype(np.float32)
-    moved = GaussianFeatures(
-        features=features.features, weights=features.weights, mean=other, space=SPACE, basis=features.basis
-    )
+    moved = replace(features, mean=other)
     scores = relevancy(moved, text, np.zeros(24, np.float32))
     expected = plain_cosine(features.decode().astype(np.float64) - other, text)
     np.testing.assert_allclose(scores[:, moved.seen], expected[:, moved.seen], atol=1e-5)
@@ -68,13 +67,8 @@ def test_the_length_of_features_does_not_matter_at_either_end(rng: np.random.Gen
     features, text, text_mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
     basis = features.basis
     mean = (basis.mean * scale).astype(np.float32)
-    scaled = GaussianFeatures(
-        features=(features.features * scale).astype(np.float32),
-        weights=features.weights,
-        mean=mean,
-        space=SPACE,
-        basis=FeatureBasis(mean=mean, components=basis.components, energy_kept=1.0, space=SPACE),
-    )
+    values = (features.features * scale).astype(np.float32)
+    scaled = replace(features, features=values, mean=mean, basis=replace(basis, mean=mean))
     for mode in ("raw", "centered"):
         a = relevancy(scaled, text, text_mean, mode=mode)
         assert np.isfinite(a[:, scaled.seen]).all()
@@ -90,12 +84,8 @@ def test_a_feature_equal_to_the_mean_answers_nothing_however_it_was_rounded(rng:
 
 
 def test_a_zero_feature_and_a_zero_word_score_zero() -> None:
-    features = GaussianFeatures(
-        features=np.zeros((2, 24), np.float32),
-        weights=np.ones(2, np.float32),
-        mean=np.zeros(24, np.float32),
-        space=SPACE,
-    )
+    zeros = np.zeros((2, 24), np.float32)
+    features = GaussianFeatures(features=zeros, weights=np.ones(2, np.float32), mean=zeros[0], space=SPACE)
     text = np.zeros((1, 24), np.float32)
     assert np.array_equal(relevancy(features, text, np.zeros(24, np.float32), mode="raw"), np.zeros((1, 2), np.float32))
 

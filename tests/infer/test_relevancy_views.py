@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from rooms import UP, splat
 from splats import random_gaussians
 
 from gsencoder.data.orbits import looking_cameras
@@ -17,25 +18,12 @@ from gsencoder.render import blend
 from gsencoder.render.images import visible_shares
 from gsencoder.types import Cameras, Gaussians, Localization, Scene, Views
 
-UP = np.array([0.0, 0.0, 1.0])
-
 
 def wall(x: float, half: float = 1.0, step: float = 0.1) -> np.ndarray:
     """Points of a square wall across the x axis."""
     side = np.arange(-half, half + step / 2, step)
     y, z = np.meshgrid(side, side)
     return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1)
-
-
-def splat_of(means: np.ndarray) -> Gaussians:
-    n = len(means)
-    return Gaussians(
-        means=means.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        scales=np.full((n, 3), 0.05, np.float32),
-        opacities=np.full(n, 0.99, np.float32),
-        sh=np.zeros((n, 1, 3), np.float32),
-    )
 
 
 def facing(*sides: float) -> Cameras:
@@ -46,21 +34,21 @@ def facing(*sides: float) -> Cameras:
 
 def test_a_wall_is_best_seen_from_its_own_side() -> None:
     left, right = wall(-0.5), wall(0.5)
-    splat = splat_of(np.concatenate([left, right]))
-    groups = [np.arange(len(left)), np.arange(len(left), len(splat))]
-    assert best_views(splat, facing(1.0, -1.0), groups, 2) == [[1, 0], [0, 1]]
+    gaussians = splat(np.concatenate([left, right]))
+    groups = [np.arange(len(left)), np.arange(len(left), len(gaussians))]
+    assert best_views(gaussians, facing(1.0, -1.0), groups, 2) == [[1, 0], [0, 1]]
 
 
 def test_the_best_views_are_those_of_all_views(monkeypatch: pytest.MonkeyPatch) -> None:
     """A depth buffer spares most blends; the oracle blends every view."""
-    splat = random_gaussians(400)
+    gaussians = random_gaussians(400)
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     centers = 3.0 * np.stack((np.cos(angles), np.sin(angles), 0.2 * np.sin(5 * angles)), axis=1)
     cameras = looking_cameras(centers, -centers / np.linalg.norm(centers, axis=1, keepdims=True), UP, 40.0, 64, 48)
     groups = [np.arange(10), np.arange(30, 45), np.arange(100, 190)]
     worth = np.zeros((24, 3))
     for view in range(24):
-        blended = blend(splat, cameras.resized(96), view)
+        blended = blend(gaussians, cameras.resized(96), view)
         for column, rows in enumerate(groups):
             member = np.zeros(400, np.float32)
             member[rows] = 1
@@ -72,7 +60,7 @@ def test_the_best_views_are_those_of_all_views(monkeypatch: pytest.MonkeyPatch) 
         return blend(gaussians, *arguments, **options)
 
     monkeypatch.setattr("gsencoder.infer.pictures.blend", counting)
-    chosen = best_views(splat, cameras, groups, 3)
+    chosen = best_views(gaussians, cameras, groups, 3)
     for column, views in enumerate(chosen):
         best = np.sort(worth[:, column])[::-1]
         np.testing.assert_array_equal(worth[views, column], np.sort(worth[views, column])[::-1])
@@ -84,32 +72,32 @@ def test_the_best_views_are_those_of_all_views(monkeypatch: pytest.MonkeyPatch) 
 def test_the_depth_buffer_sees_what_blending_sees() -> None:
     """Two walls, one behind the other from each side: shares of the pictures, and what hides what."""
     left, right = wall(-0.5), wall(0.5)
-    splat = splat_of(np.concatenate([left, right]))
-    groups = [np.arange(len(left)), np.arange(len(left), len(splat)), np.zeros(0, np.int64)]
+    gaussians = splat(np.concatenate([left, right]))
+    groups = [np.arange(len(left)), np.arange(len(left), len(gaussians)), np.zeros(0, np.int64)]
     cameras = facing(1.0, -1.0)
-    shares = visible_shares(splat, cameras, groups)
+    shares = visible_shares(gaussians, cameras, groups)
     for view, (seen, hidden) in enumerate(((1, 0), (0, 1))):
-        member = np.zeros(len(splat), np.float32)
+        member = np.zeros(len(gaussians), np.float32)
         member[groups[seen]] = 1
-        exact = float(blend(splat, cameras, view).render(torch.from_numpy(member)).mean())
+        exact = float(blend(gaussians, cameras, view).render(torch.from_numpy(member)).mean())
         assert shares[view, seen] == pytest.approx(exact, rel=0.15)
         assert shares[view, hidden] < 0.02
         assert shares[view, 2] == 0
-    clear = replace(splat, opacities=np.full(len(splat), 0.1, np.float32))
+    clear = replace(gaussians, opacities=np.full(len(gaussians), 0.1, np.float32))
     assert not visible_shares(clear, cameras, groups).any()
 
 
 def test_views_that_show_nothing_come_in_their_own_order() -> None:
-    splat = splat_of(wall(50.0))
+    gaussians = splat(wall(50.0))
     cameras = looking_cameras(np.zeros((3, 3)), np.tile([-1.0, 0, 0], (3, 1)), UP, 40.0, 64, 48)
-    assert best_views(splat, cameras, [np.arange(5)], 3) == [[0, 1, 2]]
+    assert best_views(gaussians, cameras, [np.arange(5)], 3) == [[0, 1, 2]]
 
 
 def test_every_word_gets_its_pictures_with_names_that_any_disk_takes() -> None:
-    splat = splat_of(wall(0.0))
+    gaussians = splat(wall(0.0))
     cameras = facing(1.0, -1.0)
-    scene = Scene(name="wall", gaussians=splat, views=Views(cameras=cameras, names=("a", "b")))
-    scores = np.linspace(0, 1, len(splat), dtype=np.float32)
+    scene = Scene(name="wall", gaussians=gaussians, views=Views(cameras=cameras, names=("a", "b")))
+    scores = np.linspace(0, 1, len(gaussians), dtype=np.float32)
     scores[3] = np.nan
     words = ("a/b\\c", "é?", "x" * 500)
     localization = Localization(
@@ -127,12 +115,12 @@ def test_every_word_gets_its_pictures_with_names_that_any_disk_takes() -> None:
 
 
 def test_the_photograph_is_on_the_left_and_relevancy_on_the_right() -> None:
-    splat = splat_of(wall(0.0))
+    gaussians = splat(wall(0.0))
     cameras = facing(1.0)
     rng = np.random.default_rng(0)
     photograph = rng.integers(0, 256, (int(cameras.heights[0]), int(cameras.widths[0]), 3), dtype=np.uint8)
     views = Views(cameras=cameras, names=("a",), images=[photograph])
-    scores = np.ones((1, len(splat)), np.float32)
+    scores = np.ones((1, len(gaussians)), np.float32)
     localization = Localization(
         queries=("wall",),
         relevancy=scores,
@@ -142,7 +130,7 @@ def test_the_photograph_is_on_the_left_and_relevancy_on_the_right() -> None:
     )
     drawn = {}
     for name, images in (("photograph", [photograph]), ("rendered", None)):
-        scene = Scene(name="wall", gaussians=splat, views=replace(views, images=images))
+        scene = Scene(name="wall", gaussians=gaussians, views=replace(views, images=images))
         ((_, picture),) = relevancy_pictures(scene, localization, per_word=1)
         drawn[name] = np.asarray(picture)
     assert drawn["photograph"].shape == drawn["rendered"].shape

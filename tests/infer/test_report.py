@@ -113,9 +113,3 @@ def test_rows_and_captions_must_fit() -> None:
         report.table(["a", "b"], [[1, 2], [3]])
     with pytest.raises(InputError, match="1 pictures but 0 captions"):
         report.pictures([np.zeros((1, 1, 3), np.uint8)], [])
-
-
-def test_an_empty_report_is_a_page() -> None:
-    report = HtmlReport("nothing")
-    report.timings({})
-    assert "nothing" in parse(report).text

@@ -152,9 +152,3 @@ def test_votes_are_the_blending_weights_of_the_views() -> None:
 def test_what_cannot_be_selected_is_refused(names: tuple[str, ...], options: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         chosen(SCENE, *names, config=SelectConfig(grow=False), **options)
-
-
-@pytest.mark.parametrize(("name", "value"), [("share", 0.0), ("share", 1.0), ("reach", float("inf")), ("views", -1)])
-def test_settings_out_of_their_range_are_refused(name: str, value: float) -> None:
-    with pytest.raises(InputError, match=name):
-        SelectConfig(**{name: value})  # type: ignore[arg-type]

@@ -1,12 +1,9 @@
 """How selections grow: labels by features, by the pixels of views, and by what lies around, on cases made by hand."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from selected_rooms import MUG, SPACE, selected_room, with_more, words
+from selected_rooms import SPACE
 
-from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer.select import (
     NO_SHARE,
     Candidates,
@@ -17,9 +14,8 @@ from gsencoder.infer.select import (
     labels_by_features,
     labels_by_pixels,
     labels_of_hidden,
-    select,
 )
-from gsencoder.types import GaussianFeatures, Scene, Views
+from gsencoder.types import GaussianFeatures
 
 USUAL = (1.0, 10.0, 10.0, 10.0, 100.0)
 """Weight of the Gaussians of an object on its pixels; their median is 10."""
@@ -64,10 +60,7 @@ def test_what_is_partly_object_is_taken_where_pixels_show_it_or_would_show_its_g
     assert label_of(0, share, seen=True, present=present, removed=removed) == expected
 
 
-@pytest.mark.parametrize(
-    ("present", "expected"),
-    [((9.5, 0.5), 0), ((8.0, 2.0), 1), (NOTHING, 1)],
-)
+@pytest.mark.parametrize(("present", "expected"), [((9.5, 0.5), 0), ((8.0, 2.0), 1), (NOTHING, 1)])
 def test_what_was_taken_is_lost_only_if_its_pixels_are_of_something_else(present, expected):
     assert label_of(1, 1.0, seen=True, present=present, removed=NOTHING) == expected
 
@@ -188,22 +181,3 @@ def test_all_boxes_of_a_word_are_one_object_whose_inside_stays() -> None:
     parts = ((np.flatnonzero(one), np.flatnonzero(other)),)
     members, _ = by_features(places, features_of(vectors), parts, relevancy[None])
     assert ((members == 1) == (one | other)).all()
-
-
-SCENE, KINDS = selected_room()
-
-
-def from_above(scene: Scene) -> Scene:
-    """The scene with one view, that looks down at the mug."""
-    above = looking_cameras(
-        np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]]), np.array([0.0, 1.0, 0.0]), 60.0, 96, 72
-    )
-    return replace(scene, views=Views(cameras=above, names=("above",)))
-
-
-def test_without_a_feature_pixels_decide_even_where_all_neighbors_say_otherwise() -> None:
-    beside = MUG * [1, 1, 0] + np.array([0.077, 0.0, 0.05])
-    scene = with_more(SCENE, beside[None], opacity=0.3)
-    alone = select(scene, ("mug",), words(), SelectConfig(views=0))[0]
-    assert alone.labels[-1] == 1
-    assert select(from_above(scene), ("mug",), words())[0].labels[-1] == 0

@@ -2,26 +2,16 @@
 
 import warnings
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from selected_rooms import EMBEDDINGS, selected_room, splat_of, words
+from viewed_targets import joined
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer import select as module
-from gsencoder.infer.select import (
-    Candidates,
-    Parts,
-    Votes,
-    box_parts,
-    find_holes,
-    sample_views,
-    select,
-    threshold_parts,
-    votes,
-)
+from gsencoder.infer.select import Parts, Votes, box_parts, find_holes, sample_views, select, threshold_parts, votes
 from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
 
 SCENE, KINDS = selected_room()
@@ -86,23 +76,6 @@ def test_a_threshold_takes_what_reaches_it_and_no_part_of_a_word_that_nothing_re
         threshold_parts(("a",), np.full((1, 2), np.nan, np.float32), 0.5)
 
 
-def test_parts_of_several_words_share_no_gaussian_when_they_grow(monkeypatch: pytest.MonkeyPatch) -> None:
-    grown: list[Parts] = []
-    by_features = module.labels_by_features
-
-    def recording(*arguments: Any) -> Candidates:
-        grown.append(arguments[2])
-        return by_features(*arguments)
-
-    monkeypatch.setattr(module, "labels_by_features", recording)
-    selection, localization = select(SCENE, ("mug", "table"), words(), threshold=0.0)
-    assert (localization.relevancy >= 0.0).all(axis=0).any()  # The rims are both.
-    for number, groups in enumerate(grown[0]):
-        for rows in groups:
-            assert (selection.seeds[rows] == number + 1).all()
-    assert sum(len(rows) for groups in grown[0] for rows in groups) == np.count_nonzero(selection.seeds)
-
-
 def two_mugs() -> Scene:
     """The scene with a second mug, paler than the first, in place of the book."""
     features = SCENE.features["names"]
@@ -159,12 +132,6 @@ def test_no_more_pixels_than_asked_for_are_looked_at(size: tuple[int, int], pixe
 @pytest.mark.parametrize(("views", "rows"), [(3, [0, 4, 8]), (20, [*range(9)]), (0, [])])
 def test_views_are_evenly_spaced_and_all_where_there_are_fewer(views: int, rows: list[int]) -> None:
     assert [view for view, _ in sample_views(camera().select([0] * 9), views)] == rows
-
-
-def test_a_faint_gaussian_alone_has_its_pixels_and_all_its_weight_on_them() -> None:
-    made = voted(sheets(0.0, opacities=(0.3,)), [1], spacing=0.02)
-    assert made.present[0, 1] == pytest.approx(0.3 * 60 * 40, rel=0.05)
-    assert made.present[0, 0] == 0
 
 
 def test_what_lies_farther_behind_the_surface_than_a_spacing_and_a_fiftieth_of_its_depth_does_not_count() -> None:
@@ -242,24 +209,9 @@ def test_the_area_of_a_hole_does_not_depend_on_the_camera_and_its_pixels_do(heig
     assert hole.pixels == pytest.approx(1600 / height**2 * stretch, rel=0.12)
 
 
-def test_a_hole_is_as_large_where_every_third_pixel_is_looked_at() -> None:
-    camera = above(1.0)
-    sparse = sample_views(camera, 1, 1000)
-    assert sparse == [(0, 3)]
-    (hole,) = find_holes(square_splat(), camera, TAKEN, sparse)
-    assert hole.area == pytest.approx(0.16, rel=0.15)
-    assert hole.pixels == pytest.approx(1600, rel=0.15)
-    assert hole.removed == pytest.approx(1600, rel=0.15)
-
-
 def test_holes_have_the_numbers_of_their_views_and_views_without_the_object_have_none() -> None:
     away, down = above(1.0, turned=True), above(1.0, 2.0)
-    cameras = Cameras(
-        cam_from_world=np.concatenate([away.cam_from_world, down.cam_from_world]),
-        Ks=np.concatenate([away.Ks, down.Ks]),
-        widths=np.concatenate([away.widths, down.widths]),
-        heights=np.concatenate([away.heights, down.heights]),
-    )
+    cameras = joined(away, down)
     holes = find_holes(square_splat(), cameras, TAKEN, sample_views(cameras, 3))
     assert [hole.view for hole in holes] == [1, 2]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rooms import corner_cameras, sheet, splat
-from viewed_targets import SHELLS, cube_in_room
+from viewed_targets import cube_in_room
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer.views.budget import (
@@ -147,15 +147,6 @@ def test_a_half_that_is_hidden_takes_a_second_view_and_the_limit_is_kept() -> No
         "right",
     }
     assert measured[-1] == pytest.approx(0.5, abs=0.05)
-
-
-@pytest.mark.slow
-def test_the_fewest_views_of_a_cube_keep_the_limit_at_the_size_of_their_pictures() -> None:
-    scene, target = cube_in_room()
-    made = choose_views_within(scene, [target], replace(SHELLS, count=8), ViewsBudget(error=0.1))
-    assert 1 < len(made.views) < made.views.judged == 16
-    assert 0 < made.predicted["error"] <= 0.1
-    assert 0 < made.realised_error(scene.gaussians, [target]) <= 0.1
 
 
 def test_an_error_comes_before_seconds() -> None:

@@ -8,18 +8,12 @@ import numpy as np
 import pytest
 import torch
 from feature_fields import make_features
-from splats import random_gaussians
+from splats import front_camera, random_gaussians
 from tiny_vlm import PATCH, SIDE, save_tiny_vlm, tokenizer
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer.views.pictures import feature_tokens, token_blends, tower_grid
-from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Gaussians
-
-
-def front_camera(width: int = 64, height: int = 64, focal: float = 60.0) -> Cameras:
-    ahead = np.array([[0, 0, 1.0]])
-    return looking_cameras(np.zeros((1, 3)), ahead, np.array([0, -1.0, 0]), focal, width, height)
+from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians
 
 
 def on(gaussians: Gaussians, features: GaussianFeatures) -> GaussianFeatures:

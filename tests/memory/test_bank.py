@@ -9,8 +9,9 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.memory import bank as bank_module
-from gsencoder.memory.bank import BankConfig, MapStream, build_bank, raw_features
-from gsencoder.memory.reduction import reduce_as_published, unit_rows
+from gsencoder.memory import reduction
+from gsencoder.memory.bank import BankConfig, MapStream, build_bank, draw_sample, raw_features
+from gsencoder.memory.reduction import CoverReduction, reduce_as_published, unit_rows
 from gsencoder.types import FeatureMap, FeatureSpace, MemoryBank
 
 SPACE = FeatureSpace(name="s", channels=16)
@@ -206,13 +207,6 @@ def test_cells_at_the_mean_have_one_component_and_take_no_part_in_the_cover(roun
     assert bank.cosine == pytest.approx((best.sum() + at_mean.sum()) / 120, abs=1e-5)
 
 
-def test_the_component_of_cells_at_the_mean_counts_among_those_that_are_asked_for() -> None:
-    maps, _ = mixed_maps()
-    for components in (20, 31, 40):
-        assert components / 2 <= len(build_bank(stream(maps), SPACE, MEAN, BankConfig(components=components)))
-        assert len(build_bank(stream(maps), SPACE, MEAN, BankConfig(components=components))) <= components
-
-
 def test_the_published_algorithm_leaves_cells_at_the_mean_out_and_says_so() -> None:
     maps, at_mean = mixed_maps()
     bank = build_bank(stream(maps), SPACE, MEAN, BankConfig(method="paper", threshold=0.5))
@@ -267,3 +261,196 @@ def test_one_component_is_refused_where_cells_at_the_mean_need_one_of_their_own(
     assert len(build_bank(stream([map_of(two, 2, 2)]), SPACE, MEAN, BankConfig(components=2))) == 2
     at_mean = np.repeat(MEAN[None], 4, axis=0)
     assert len(build_bank(stream([map_of(at_mean, 2, 2)]), SPACE, MEAN, BankConfig(components=1))) == 1
+
+
+def redundant_rows(rng: np.random.Generator, count: int, channels: int = 16) -> np.ndarray:
+    """Rows between pairs of a few directions, most near one of them, of many lengths."""
+    centers = rng.normal(size=(12, channels))
+    one, other = centers[rng.integers(0, 12, (2, count))]
+    share = rng.random((count, 1)) ** 3
+    rows = one * (1 - share) + other * share + 0.08 * rng.normal(size=(count, channels))
+    return (rows * np.exp(rng.normal(size=(count, 1)))).astype(np.float32)
+
+
+def cover_of(features: np.ndarray, threshold: float) -> np.ndarray:
+    cover = CoverReduction(features.shape[1], threshold)
+    cover.add(features)
+    return cover.rows
+
+
+def published(features: np.ndarray, threshold: float) -> np.ndarray:
+    return reduce_as_published(unit_rows(features), threshold)[0]
+
+
+def transcription(
+    features: np.ndarray, threshold: float, chunk: int, *, drop_last: bool
+) -> tuple[list[int], np.ndarray]:
+    """Algorithm 1, line by line; the code that M3's authors published does not drop the last chunk."""
+    unit = features / np.linalg.norm(features, axis=1, keepdims=True)
+    components, used = [], np.zeros(len(unit), bool)
+    for k in range(len(unit) // chunk if drop_last else -(-len(unit) // chunk)):
+        similarities = unit[k * chunk : (k + 1) * chunk] @ unit.T
+        for j, row in enumerate(similarities, start=k * chunk):
+            if not used[j]:
+                neighbors = np.flatnonzero(row >= threshold)
+                if not used[neighbors].any():
+                    components.append(j)
+                    used[neighbors] = True
+    return components, used
+
+
+@pytest.mark.parametrize("drop_last", [False, True])
+@pytest.mark.parametrize("threshold", [0.5, 0.9, 0.98])
+def test_the_published_algorithm_gives_what_its_transcription_gives(rng, monkeypatch, threshold, drop_last):
+    # Few witnesses and small products, so that rows are settled in all three ways.
+    monkeypatch.setattr(reduction, "WITNESSES", 20)
+    monkeypatch.setattr(reduction, "BLOCK", 100)
+    monkeypatch.setattr(reduction, "PRODUCT_VALUES", 30_000)
+    features = redundant_rows(rng, 1070)
+    components, used = transcription(features, threshold, 100, drop_last=drop_last)
+    rows, in_use = reduce_as_published(unit_rows(features), threshold, drop_last=100 if drop_last else 0)
+    assert 5 <= len(components) < 1000
+    assert rows.tolist() == components
+    np.testing.assert_array_equal(in_use, used)
+
+
+@pytest.mark.parametrize("threshold", [0.3, 0.9, 0.99])
+def test_every_feature_is_within_the_threshold_of_a_component_of_a_cover(rng, threshold):
+    features = redundant_rows(rng, 3000)
+    rows = cover_of(features, threshold)
+    unit = features.astype(np.float64)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    cosines = unit @ unit[rows].T
+    assert cosines.max(axis=1).min() >= threshold
+    assert 1 < len(rows) < 3000
+    # No component stands for another one.
+    among = np.triu(cosines[rows], k=1)
+    assert among.max() < threshold + 2 * reduction.ROUNDING
+
+
+def test_a_feature_whose_cosine_only_rounds_to_the_threshold_has_a_component_of_its_own(rng):
+    """So that a cover holds in exact arithmetic."""
+    leader = rng.normal(size=96)
+    leader /= np.linalg.norm(leader)
+    across = rng.normal(size=(150, 96))
+    across -= (across @ leader)[:, None] * leader
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    cosine = 0.5 + rng.uniform(-1e-7, 1e-7, (150, 1))
+    features = np.concatenate([leader[None], cosine * leader + np.sqrt(1 - cosine**2) * across]).astype(np.float32)
+    unit = features.astype(np.float64)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    assert ((unit @ unit[0])[1:] < 0.5).sum() > 30
+    assert (unit @ unit[cover_of(features, 0.5)].T).max(axis=1).min() >= 0.5
+
+
+def test_a_cover_is_the_same_however_features_are_divided(rng: np.random.Generator) -> None:
+    features, whole = redundant_rows(rng, 3000), CoverReduction(16, 0.8)
+    whole.add(features)
+    parts = CoverReduction(16, 0.8)
+    for part in np.split(features, [1, 500, 501, 2600]):
+        parts.add(part)
+    assert parts.rows.tolist() == whole.rows.tolist()
+    np.testing.assert_array_equal(whole.components, features[whole.rows])
+    np.testing.assert_array_equal(whole.unit, unit_rows(features)[whole.rows])
+
+
+@pytest.mark.parametrize("reduce", [published, cover_of])
+def test_equal_directions_are_one_component_and_others_each_at_a_threshold_of_one(rng, reduce):
+    """Though the product of a row with itself may round to less than 1."""
+    direction = np.linspace(-1, 2, 384, dtype=np.float32)
+    features = np.stack([direction * length for length in (1e-30, 1, 3e37, 7, 1e-3)]).astype(np.float32)
+    for threshold in (0.5, 1.0):
+        assert reduce(features, threshold).tolist() == [0]
+        assert reduce(features[:1], threshold).tolist() == [0]
+    assert reduce(rng.normal(size=(300, 17)).astype(np.float32), 1.0).tolist() == list(range(300))
+
+
+def test_what_has_no_direction_is_refused() -> None:
+    for value, what in ((0.0, "zero"), (np.nan, "not finite"), (np.inf, "not finite")):
+        broken = np.ones((4, 3), np.float32)
+        broken[2] = value
+        with pytest.raises(InputError, match=f"1 of 4 rows have no direction: row 2 is {what}"):
+            cover_of(broken, 0.5)
+
+
+NUMBERS = FeatureSpace(name="numbers", channels=2)
+AFFINE = np.array([[0.5, 0, 0], [0, 0.25, 0]])
+
+
+def numbered_maps(*sizes: tuple[int, int], missing: float = 0.0) -> list[FeatureMap]:
+    """Maps whose features are the number of the map and that of the cell."""
+    maps, rng = [], np.random.default_rng(0)
+    for number, (height, width) in enumerate(sizes):
+        cells = np.arange(height * width).reshape(height, width)
+        features = np.stack([np.full_like(cells, number), cells], axis=2).astype(np.float32)
+        features[rng.random((height, width)) < missing] = np.nan
+        maps.append(FeatureMap(features=features, grid_from_image=AFFINE * (number + 1), space=NUMBERS))
+    return maps
+
+
+def numbered_stream(maps: list[FeatureMap]) -> MapStream:
+    def give() -> Iterator[tuple[int, FeatureMap]]:
+        return iter(enumerate(maps))
+
+    return give
+
+
+@pytest.mark.parametrize("limit", [1, 59, 60, 61])
+def test_a_sample_has_so_many_different_features_of_the_maps_in_their_order(limit: int) -> None:
+    maps = numbered_maps((4, 5), (3, 10), (2, 5))
+    sample = draw_sample(numbered_stream(maps), NUMBERS, limit)
+    assert sample.total == 60
+    assert len(sample.features) == min(limit, 60)
+    keys = [(view, cell) for view, cell in sample.features.tolist()]
+    assert keys == sorted(set(keys))
+    assert set(keys) <= {(view, cell) for view, cells in enumerate((20, 30, 10)) for cell in range(cells)}
+
+
+def test_cells_without_a_feature_are_in_no_sample_and_not_counted() -> None:
+    maps = numbered_maps((20, 20), (20, 20), missing=0.5)
+    sample = draw_sample(numbered_stream(maps), NUMBERS, 10_000)
+    rows = np.concatenate([raw_features(view, each)[0] for view, each in enumerate(maps)])
+    np.testing.assert_array_equal(sample.features, rows)
+    assert sample.total == len(rows) < 500
+    empty = draw_sample(numbered_stream(numbered_maps((3, 3), missing=1.1)), NUMBERS, 5)
+    assert (empty.features.shape, empty.total) == ((0, 2), 0)
+
+
+def test_every_feature_is_drawn_equally_often() -> None:
+    """Views of any size and columns of any map: counts over seeds are those of independent draws."""
+    maps = numbered_maps((2, 32), (1, 4), (4, 8))
+    seeds, limit = 300, 25
+    counts = {}
+    for seed in range(seeds):
+        for key in map(tuple, draw_sample(numbered_stream(maps), NUMBERS, limit, seed=seed).features.tolist()):
+            counts[key] = counts.get(key, 0) + 1
+    drawn = np.array([counts.get((view, cell), 0) for view, n in enumerate((64, 4, 32)) for cell in range(n)])
+    share = limit / 100
+    deviation = (drawn - seeds * share) / np.sqrt(seeds * share * (1 - share))
+    assert np.abs(deviation).max() < 4.5
+    assert np.square(deviation).mean() == pytest.approx(1, abs=0.5)
+
+
+def test_a_view_is_sampled_whatever_cells_another_view_gives() -> None:
+    sample = draw_sample(numbered_stream(numbered_maps((20, 20), (20, 20))), NUMBERS, 200)
+    first, second = (set(sample.features[sample.features[:, 0] == view, 1].tolist()) for view in (0, 1))
+    # A quarter of all cells is drawn, and a quarter of these in the other view as well.
+    assert len(first & second) < 0.5 * min(len(first), len(second))
+
+
+def test_a_seed_gives_the_same_sample_again_and_another_seed_another_one() -> None:
+    maps = numbered_stream(numbered_maps((10, 10), (10, 10)))
+    first, again, other = (draw_sample(maps, NUMBERS, 20, seed=seed).features for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_the_cell_of_a_component_is_where_the_affine_of_its_map_puts_its_source() -> None:
+    maps = numbered_maps((4, 5), (3, 10), (2, 5))
+    bank = build_bank(numbered_stream(maps), NUMBERS, np.zeros(2, np.float32))
+    assert len(bank) > 2
+    assert len(set(bank.sources[:, 0].tolist())) > 1
+    for (view, row, column), (left, top, right, bottom) in zip(bank.sources.tolist(), bank.cells, strict=True):
+        affine = maps[view].grid_from_image
+        corners = affine @ np.array([[left, right], [top, bottom], [1, 1]])
+        np.testing.assert_allclose(corners, [[column, column + 1], [row, row + 1]], atol=1e-12)

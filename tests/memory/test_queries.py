@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from feature_fields import SPACE, make_features
-from memory_samples import memory_of_features
+from memory_samples import make_bank, memory_of_features
 
 from gsencoder.core.errors import InputError
 from gsencoder.memory.bank import principal_queries
@@ -16,16 +16,8 @@ from gsencoder.types.features import Scoring
 def bank_of(features: GaussianFeatures, scoring: Scoring = "centered") -> MemoryBank:
     """Every seventh feature that was seen."""
     rows = features.decode(np.flatnonzero(features.seen)[::7])
-    return MemoryBank(
-        components=rows,
-        sources=np.zeros((len(rows), 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (len(rows), 1, 1)),
-        mean=features.mean if scoring == "centered" else np.zeros_like(features.mean),
-        threshold=0.9,
-        coverage=1.0,
-        cosine=1.0,
-        space=features.space,
-    )
+    mean = features.mean if scoring == "centered" else np.zeros_like(features.mean)
+    return make_bank(rows, mean, features.space)
 
 
 @pytest.mark.parametrize("basis", [True, False])

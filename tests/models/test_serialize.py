@@ -10,13 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.models.grid import (
-    ALIGN,
-    MAX_EXTENT,
-    Order,
-    curve_from_morton,
-    morton_codes,
-)
+from gsencoder.models.grid import ALIGN, MAX_EXTENT, Order, curve_from_morton, morton_codes
 from gsencoder.models.plan import grid_coords
 
 ORDERS = ("z", "z-trans", "hilbert", "hilbert-trans")

@@ -70,7 +70,6 @@ def with_header(path: Path, change: dict) -> None:
     ("change", "message"),
     [
         ({"encoder": {"voxel": 0.1, "depth": 3}}, "configuration does not fit this version"),
-        ({"encoder": {"voxel": -1.0}}, "voxel: expected above 0"),
         ({"encoder": None}, "expected encoder"),
         ({"scale": 0.0}, "scale"),
         ({"dtype": "int8"}, "expected parameters of float32 or float16"),

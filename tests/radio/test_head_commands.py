@@ -1,5 +1,8 @@
 """SplatDistill's way with a small random RADIO: fused, distilled, adapter heads applied after; words in, boxes out."""
 
+import shutil
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,13 +10,15 @@ import numpy as np
 import pytest
 from command_runs import refusal, results_of
 from radio_world import QUICK, SEEDS, World, run
-from symbolic import symbolic_sizes
+from radios import small_joint_model
 
 from gsencoder.app import main as cli
+from gsencoder.app.heads import words_of_head
 from gsencoder.app.scenes import load_query
 from gsencoder.core.archive import open_archive
+from gsencoder.core.errors import SceneWarning
 from gsencoder.fusion.folder import load_features
-from gsencoder.fusion.measured_heads import find_head, head_outputs, load_heads
+from gsencoder.fusion.measured_heads import find_head, head_outputs, load_heads, save_heads
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.text.models import TransformersTextConfig
@@ -51,16 +56,8 @@ def test_fusing_leaves_measured_heads_and_says_what_the_basis_costs_each(fused: 
 
 
 def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(world, fused, tmp_path):
-    run(
-        "localize",
-        str(fused),
-        "head=siglip",
-        f"query={WORDS}",
-        *world.text,
-        *EVERY_BOX,
-        "pictures=1",
-        f"out={tmp_path / 'b'}",
-    )
+    asked = ("head=siglip", f"query={WORDS}", *world.text, *EVERY_BOX)
+    run("localize", str(fused), *asked, "pictures=1", f"out={tmp_path / 'b'}")
     results = results_of(tmp_path / "b")
     assert results["space"].startswith("radio-radio/siglip.summary · 16 channels · radio")
     assert results["boxes"]
@@ -75,10 +72,7 @@ def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(wor
     config = TransformersTextConfig(model=str(world.siglip))
     head_scene, table = load_query(scene, fused, head="siglip", text=config)
     made = localize(
-        head_scene,
-        ["mug"],
-        table,
-        LocalizeConfig(min_probability=0.0, threshold=ThresholdConfig(kind="relative")),
+        head_scene, ["mug"], table, LocalizeConfig(min_probability=0.0, threshold=ThresholdConfig(kind="relative"))
     )
     np.testing.assert_allclose(made.relevancy[0][features.seen], cosines[features.seen], atol=1e-4)
 
@@ -106,16 +100,8 @@ def test_training_stores_the_heads_of_its_loss_and_those_asked_for_besides(train
 
 def test_encoded_features_carry_the_heads_of_the_weights(world, trained, encoded, tmp_path):
     assert (encoded / "heads.safetensors").read_bytes() == (trained / "heads.safetensors").read_bytes()
-    run(
-        "localize",
-        str(encoded),
-        "head=siglip",
-        f"query={WORDS}",
-        *world.text,
-        *EVERY_BOX,
-        "pictures=0",
-        f"out={tmp_path / 'b'}",
-    )
+    asked = ("head=siglip", f"query={WORDS}", *world.text, *EVERY_BOX)
+    run("localize", str(encoded), *asked, "pictures=0", f"out={tmp_path / 'b'}")
     assert results_of(tmp_path / "b")["boxes"]
 
 
@@ -123,17 +109,8 @@ def test_encoded_features_carry_the_heads_of_the_weights(world, trained, encoded
 def test_outputs_of_a_head_are_evaluated(world, trained, tmp_path, source, protocol):
     of = (f"weights={trained}",) if source == "weights" else world.teacher
     limits = ("protocol.min_views=1", "protocol.min_pixels=5") if protocol == "localization" else ()
-    run(
-        "evaluate",
-        world.room(1),
-        *of,
-        "head=siglip",
-        *world.text,
-        *SEEDS,
-        f"protocol={protocol}",
-        *limits,
-        f"out={tmp_path / 'e'}",
-    )
+    asked = (*of, "head=siglip", *world.text, *SEEDS, f"protocol={protocol}", *limits)
+    run("evaluate", world.room(1), *asked, f"out={tmp_path / 'e'}")
     results = results_of(tmp_path / "e")
     assert results["objects" if protocol == "localization" else "names"]
 
@@ -197,13 +174,96 @@ def test_a_training_goes_on_only_with_the_heads_that_it_began_with(world, traine
     assert {path: path.read_bytes() for path in written} == written
 
 
-def test_an_exported_encoder_carries_its_heads(world: World, trained: Path, encoded: Path, tmp_path: Path) -> None:
-    pytest.importorskip("onnxscript")
-    graph = tmp_path / "encoder.onnx"
-    with symbolic_sizes():
-        run("export", f"weights={trained}", "sizes=1,500", f"out={graph}")
-    assert (
-        load_heads(tmp_path / "encoder.onnx.heads.safetensors").names == load_heads(trained / "heads.safetensors").names
+def test_heads_of_another_backbone_are_refused(world, fused, tmp_path, capsys):
+    copy = tmp_path / "fused"
+    shutil.copytree(fused, copy)
+    heads = load_heads(copy / "heads.safetensors")
+    save_heads(copy / "heads.safetensors", replace(heads, space=replace(heads.space, weights="other")))
+    arguments = ("localize", str(copy), "head=siglip", "query=mug", *world.text, f"out={tmp_path / 'x'}")
+    line = refusal(capsys, *arguments)
+    assert "heads take features of (radio-radio · 24 channels" in line
+    assert "expected heads of the same backbone" in line
+    line = refusal(
+        capsys, "views", str(copy), "head=sam", "choose.method=uniform", "grid=[2,2]", f"out={tmp_path / 'x'}"
     )
-    run("encode", world.room(1), f"weights={graph}", *SEEDS, f"out={tmp_path / 'encoded'}")
-    assert (tmp_path / "encoded" / "heads.safetensors").read_bytes() == (encoded / "heads.safetensors").read_bytes()
+    assert "heads take features of" in line
+    assert "heads take features of" in refusal(capsys, "pack", str(copy), f"out={tmp_path / 'x'}")
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("head=dino", "query=mug"), "head=dino: not among the heads at hand: siglip.summary, siglip.features, sam"),
+        (
+            ("head=sam", "query=mug"),
+            "head sam.features (vit-h): leads to no model with a text side (siglip2, siglip, clip)",
+        ),
+        (
+            ("head=siglip.features", "query=mug"),
+            "words are compared with summary heads, since outputs of feature heads are not aligned",
+        ),
+        (("query=mug",), "there is no words.safetensors beside these features"),
+    ],
+)
+def test_a_head_that_words_cannot_be_compared_with_is_refused(world, fused, tmp_path, capsys, words, message):
+    text = world.text if any(word.startswith("head=") for word in words) else ()
+    assert message in refusal(capsys, "localize", str(fused), *words, *text, f"out={tmp_path / 'x'}")
+
+
+def test_words_of_another_model_are_refused_and_both_are_named(world, fused, tmp_path, capsys):
+    arguments = ("localize", str(fused), "head=siglip", "query=mug", f"out={tmp_path / 'x'}")
+    assert (
+        "no words lead into its space; give text=transformers text.model=FOLDER, the text side of ViT-SO400M-14-Sig"
+        in (refusal(capsys, *arguments))
+    )
+    wide = small_joint_model(tmp_path / "wide", channels=12)
+    line = refusal(capsys, *arguments, "text=transformers", f"text.model={wide}")
+    assert (
+        "head siglip.summary (ViT-SO400M-14-SigLIP-384) gives vectors of 16 channels, and the words of 'wide' have 12"
+        in line
+    )
+    clip = small_joint_model(tmp_path / "clip", kind="clip")
+    line = refusal(capsys, *arguments, "text=transformers", f"text.model={clip}")
+    assert "leads to a siglip model, and the words of 'clip' are those of a clip model" in line
+
+
+def test_features_without_heads_and_heads_without_features_are_refused(world, fused, trained, tmp_path, capsys):
+    copy = tmp_path / "fused"
+    shutil.copytree(fused, copy)
+    (copy / "heads.safetensors").unlink()
+    arguments = ("localize", str(copy), "head=siglip", "query=mug", *world.text, f"out={tmp_path / 'x'}")
+    assert "head=siglip: there is no heads.safetensors in" in refusal(capsys, *arguments)
+    weights = tmp_path / "encoder"
+    shutil.copytree(trained, weights)
+    (weights / "heads.safetensors").unlink()
+    evaluated = ("evaluate", world.room(1), f"weights={weights}", "head=siglip", *world.text, f"out={tmp_path / 'x'}")
+    assert "head=siglip: no adapter heads lie beside the weights" in refusal(capsys, *evaluated)
+    shutil.copyfile(fused / "heads.safetensors", weights / "heads.safetensors")
+    heads = load_heads(weights / "heads.safetensors")
+    save_heads(weights / "heads.safetensors", replace(heads, space=replace(heads.space, weights="other")))
+    line = refusal(capsys, "encode", world.room(1), f"weights={weights}", *SEEDS, f"out={tmp_path / 'x'}")
+    assert "heads take features of" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("heads=siglip", "teacher=palette"), "heads=siglip: teacher=palette has no adapter heads"),
+        (("heads=[siglip,siglip.summary]",), "heads: siglip, siglip.summary names a head twice"),
+    ],
+)
+def test_heads_that_a_training_cannot_use_are_refused(world, tmp_path, capsys, words, message):
+    teacher = () if any(word.startswith("teacher=") for word in words) else world.teacher
+    out = f"out={tmp_path / 'run'}"
+    assert message in refusal(capsys, "train", world.room(0), *teacher, *words, *SEEDS, *QUICK[1:], out)
+
+
+def test_a_siglip2_head_with_a_tower_that_keeps_capital_letters_warns(fused: Path, tmp_path: Path) -> None:
+    folder = str(small_joint_model(tmp_path / "siglip2", kind="siglip2"))
+    head = replace(find_head(load_heads(fused / "heads.safetensors"), "siglip").head, text="siglip2")
+    with pytest.warns(SceneWarning, match="give text.lower=yes"):
+        words_of_head(head, "", TransformersTextConfig(model=folder, lower="no"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        words_of_head(head, "", TransformersTextConfig(model=folder))

@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.labels.files import box_corners
 from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.benchmarks.answers import read_answer_predictions
+from gsencoder.evaluate.benchmarks.captions import CaptionedObject, read_caption_predictions
 
 SCANQA = (
     Question(dataset="scanqa", id="q0", scene="s0", text="What?", answers=("chair",)),
@@ -67,8 +69,6 @@ def test_sqa3ds_answers_are_found_by_situation_and_place(tmp_path: Path) -> None
         ([entry(scene_id="s1")], "entry 0: question q0 is about s0, got s1"),
         ([{"answer": "x"}], "entry 0: says not which question it answers"),
         ([entry(answer_top10="chair")], "entry 0: answer_top10 must be a list of texts, got 'chair'"),
-        ([entry(answer_top10=[])], "entry 0: answer_top10 has 0 answers, expected 1 to 10"),
-        ([{"question_id": "q0", "answer": 3}], "entry 0: answer must be a text, got 3"),
         ([{"question_id": "q0", "answers": ["x"]}], "got answers, which truth has; were predictions and truth swapped"),
         ({"questions": []}, "got SQA3D's truth; were predictions and truth swapped"),
     ],
@@ -109,3 +109,58 @@ def test_equal_questions_are_answered_in_the_order_of_the_file(tmp_path: Path) -
         assert read_answer_predictions(written(tmp_path, rows[2:]), truth) == {"0": ("up",)}
     with pytest.warns(SceneWarning, match="3 entries"), pytest.raises(InputError, match="have one question_id: 0"):
         read_answer_predictions(written(tmp_path, rows), truth)
+
+
+OBJECTS = tuple(
+    CaptionedObject(scene=scene, object_id=number, object_name="office_chair", captions=("sos a chair eos",))
+    for scene, number in (("s0", 3), ("s0", 4), ("s1", 3))
+)
+CORNERS = box_corners((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+
+
+def written_captions(folder: Path, content: Any) -> Path:
+    path = folder / "pred.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def row(**changes: Any) -> dict[str, Any]:
+    return {"caption": "sos a chair eos", "box": CORNERS, "sem_prob": [0.5, 0.5], "obj_prob": [0.25, 0.75]} | changes
+
+
+def test_captions_of_boxes_are_read_as_the_benchmark_takes_them(tmp_path: Path) -> None:
+    content = {"s0": [row(), {"caption": "", "box": CORNERS[::-1]}], "s1": []}
+    aabb = ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    expected = {"s0": [("sos a chair eos", aabb), ("", aabb)]}
+    assert read_caption_predictions(written_captions(tmp_path, content), OBJECTS) == (expected, {})
+
+
+def test_captions_of_given_objects_are_read_as_scan2cap_writes_them(tmp_path: Path) -> None:
+    path = written_captions(tmp_path, {"s0|3|office_chair": ["sos a chair eos"], "s1|3": ["b"]})
+    assert read_caption_predictions(path, OBJECTS) == ({}, {("s0", 3): "sos a chair eos", ("s1", 3): "b"})
+    assert read_caption_predictions(written_captions(tmp_path, {}), OBJECTS) == ({}, {})
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"s9": [row()]}, "'s9': is no scene of the truth"),
+        ({"s0": row()}, "pred.json: s0 must be a list of objects with caption and box, got an object"),
+        ({"s0": [row(), row(box=None)]}, r"s0\[1\]: box must be a list of 8 corners"),
+        ({"s0|3|lamp": ["a"]}, "the truth calls this object 'office_chair'"),
+        ({"s0|3": ["a"], "s0|3|office_chair": ["b"]}, r"is the same object as 's0\|3'"),
+        ([{"ann_id": "1"}], "this is truth: were predictions and truth swapped"),
+        ([], "expected an object from scenes"),
+    ],
+)
+def test_a_wrong_entry_of_captions_is_named(tmp_path: Path, content: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_caption_predictions(written_captions(tmp_path, content), OBJECTS)
+    assert "pred.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_that_is_there_twice_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "pred.json").write_text('{"s0": [], "s0": []}')
+    with pytest.raises(InputError, match="'s0' is there twice"):
+        read_caption_predictions(tmp_path / "pred.json", OBJECTS)

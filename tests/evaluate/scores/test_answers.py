@@ -46,9 +46,7 @@ def question(
         ("3 o'  clock, 3 oclock", "three o'clock, three o'clock"),
         ("tv on the letf", "TV on left"),
         ("go backwards", "go backward"),
-        ("a", "a"),
         ("the the chair", "the chair"),
-        ("?!", ""),
         ("black & white", "black  white"),
     ],
 )
@@ -76,15 +74,7 @@ def test_the_refined_match_is_leos(answer: str, references: list[str], match: tu
 
 
 @pytest.mark.parametrize(
-    ("text", "kind"),
-    [
-        ("  whatever", "what"),
-        ("Isn't it?", "is"),
-        ("HOW many", "how"),
-        ("Can I", "can"),
-        ("Which one", "which"),
-        ("", "other"),
-    ],
+    ("text", "kind"), [("  whatever", "what"), ("Isn't it?", "is"), ("HOW many", "how"), ("", "other")]
 )
 def test_the_kind_of_an_sqa3d_question_is_its_first_letters(text: str, kind: str) -> None:
     assert sqa3d_kind(text) == kind
@@ -107,24 +97,6 @@ def test_the_kind_of_a_scanqa_question_is_the_first_that_has_a_phrase_of_it(text
     assert scanqa_kind(text) == kind
 
 
-def test_means_are_over_all_questions_and_a_missing_one_counts_as_wrong() -> None:
-    questions = [
-        question("a", "chair", scene="s1"),
-        question("b", "two", "2", scene="s0", text="How many?"),
-        question("c", "brown table", scene="s0", text="Is it?"),
-        question("d", "left", scene="s0"),
-    ]
-    predictions = {"a": ["table", "chair"], "b": ["2"], "c": ["Brown table"]}
-    scores = score_answers(questions, predictions, tools=NO_JAVA, lemmatize=NO_WORDNET)
-    # Letter for letter: b alone of the first answers, a besides of all. Cleaned: b and c; refined: the same.
-    means = mean_answers(scores.rows)
-    assert [means[name] for name in ("em_1", "em_10", "em_cleaned", "em_refined")] == [1 / 4, 2 / 4, 2 / 4, 2 / 4]
-    assert [row["predicted"] for row in scores.rows] == [True, True, True, False]
-    assert [row["kind"] for row in scores.rows] == ["what", "how", "is", "what"]
-    assert scores.absent == {"F-value": NO_WORDNET, "METEOR": NO_JAVA}
-    assert math.isnan(means["f_value"])
-
-
 def test_a_missing_answer_counts_in_the_sentence_scores_as_an_empty_one() -> None:
     questions = [question("a", "brown chair"), question("b", "red table")]
     scores = score_answers(questions, {"a": ["brown chair"]}, tools=NO_JAVA, lemmatize=NO_WORDNET).sentences
@@ -132,13 +104,6 @@ def test_a_missing_answer_counts_in_the_sentence_scores_as_an_empty_one() -> Non
     assert scores.bleu[0] == pytest.approx(np.exp(-1))
     assert scores.rouge_l == pytest.approx(0.5)
     assert scores.cider_each[1] == 0
-
-
-def test_em10_of_single_answers_is_absent_and_blank_answers_are_refined_right() -> None:
-    questions = [question("a", "chair"), question("b", "table")]
-    scores = score_answers(questions, {"a": ["?"], "b": ["table"]}, tools=NO_JAVA, lemmatize=NO_WORDNET)
-    assert "more than one" in scores.absent["EM@10"]
-    assert mean_answers(scores.rows)["em_refined"] == 1
 
 
 def test_the_f_value_is_one_for_an_equal_answer_and_else_the_best_f1_of_lemmas() -> None:
