@@ -17,7 +17,7 @@ from gsencoder.render import BlendConfig
 from gsencoder.types import FeatureMap, Scene, Views
 
 TORCH = BlendConfig(backend="torch")
-VIEWS = 3
+VIEWS = 2
 DEPTHS = tuple(np.full((24, 32), 2.0 + 0.3 * view, np.float32) for view in range(VIEWS))
 MASKS = tuple(np.random.default_rng(view).random((24, 32)) < 0.7 for view in range(VIEWS))
 TABLE = np.random.default_rng(0).normal(size=(7, 6)).astype(np.float32)
@@ -41,7 +41,7 @@ def teacher_of(kind: str) -> Any:
     rng = np.random.default_rng(1)
     if kind == "dense":
         maps = [rng.normal(size=(6, 8, 6)).astype(np.float32) for _ in range(VIEWS)]
-        maps[2][1, 3] = np.nan
+        maps[1][1, 3] = np.nan
         return FixedTeacher(maps)
     codes = [rng.integers(-1, 7, (24, 32)).astype(np.int32) for _ in range(VIEWS)]
     return CodedTeacher(codes, TABLE) if kind == "coded" else OwnTables(codes, TABLE)

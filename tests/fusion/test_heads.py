@@ -237,16 +237,6 @@ def test_features_through_a_head_are_its_outputs_for_the_decoded_vectors(rank: i
     )
 
 
-def test_rows_that_are_equal_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsencoder.fusion import measured_heads as apply
-
-    computed = []
-    original = apply.head_outputs
-    monkeypatch.setattr(apply, "head_outputs", lambda head, x: computed.append(len(x)) or original(head, x))
-    head_features(fields(), measured(), SPACE)
-    assert sum(computed) == 11
-
-
 def test_tokens_go_through_a_head_one_by_one() -> None:
     tokens, head = torch.randn(2, 5, 6), measured()
     made = head_tokens(tokens, head)

@@ -147,8 +147,7 @@ def test_a_center_is_lifted_from_the_cell_that_it_projects_into() -> None:
 
 
 @pytest.mark.parametrize(
-    ("across", "down", "rays", "most"),
-    [(4, 4, 64, 16), (4, 4, 9, 9), (4, 9, 100, 36), (0.5, 0.5, 16, 1)],
+    ("across", "down", "rays", "most"), [(4, 4, 64, 16), (4, 4, 9, 9), (4, 9, 100, 36), (0.5, 0.5, 16, 1)]
 )
 def test_a_cell_has_no_more_rays_than_pixels(across: float, down: float, rays: int, most: int) -> None:
     feature_map = FeatureMap(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from splats import front_camera, random_gaussians
+from fixed_teachers import make_scene
 from training_scenes import PREPARE, prepared
 from training_scenes import SPACE as SIDES
 from training_scenes import scene as side_scene
@@ -15,7 +15,7 @@ from gsencoder.fusion.basis import distinct_rows
 from gsencoder.fusion.checkpoint import CachedTeacher
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig
-from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Scene, Views
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=6)
 IDENTITY = np.array([[1.0, 0, 0], [0, 1.0, 0]])
@@ -55,15 +55,7 @@ class OwnTables:
 
 
 def scene_of(masks: list[np.ndarray] | None = None) -> Scene:
-    one, count = front_camera(SIZE[1], SIZE[0], 30.0), len(REGIONS)
-    cameras = Cameras(
-        cam_from_world=np.repeat(one.cam_from_world, count, axis=0),
-        Ks=np.repeat(one.Ks, count, axis=0),
-        widths=np.repeat(one.widths, count),
-        heights=np.repeat(one.heights, count),
-    )
-    views = Views(cameras=cameras, names=tuple("abcd"), masks=masks)
-    return Scene(name="s", gaussians=random_gaussians(150), views=views)
+    return make_scene(count=len(REGIONS), masks=masks)
 
 
 @pytest.mark.parametrize("lift", ["blend", "center"])

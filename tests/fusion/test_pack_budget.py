@@ -113,12 +113,6 @@ def test_megabytes_that_nothing_fits_into_are_refused_with_those_that_something_
     assert made["size"] == pytest.approx(float(smallest[1]), abs=1e-4)
 
 
-def test_the_size_that_is_planned_is_that_of_the_file(pack: Pack) -> None:
-    for form, step in (("compact", 0.0016 + 0.0004), ("index", 0.004)):
-        size = pack(f"form={form}", "budget.megabytes=0.016")["size"]
-        assert 0.016 - step <= size <= 0.016
-
-
 def test_a_budget_is_refused_beside_what_it_chooses_and_where_nothing_can_be_chosen(folder, tmp_path, capsys):
     for words, message in (
         (["form=index", "index.threshold=0.8"], "index.threshold=0.8: is chosen by budget.error"),

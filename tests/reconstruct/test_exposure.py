@@ -1,6 +1,7 @@
 """Affine colors: recovered where photographs differ, unused where they agree, predicted for held-out photographs."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -37,9 +38,9 @@ def exposed_views(gains: np.ndarray) -> Views:
     return replace(views, images=images)
 
 
-def fitted(views: Views, config: OptimizeConfig = CONFIG) -> Optimizer:
+def fitted(views: Views, config: OptimizeConfig, steps: int) -> Optimizer:
     one = wall_optimizer(config, seed_from_depth(wall_views(6, depth=True), voxel=0.1), views, TRAINING)
-    for _ in range(config.steps):
+    for _ in range(steps):
         one.advance()
     return one
 
@@ -102,23 +103,20 @@ def test_what_all_maps_have_in_common_is_not_applied() -> None:
 @pytest.mark.parametrize(("gains", "stays"), [(np.ones(6), False), (GAINS, True)])
 def test_maps_are_given_up_after_three_looks_at_each_photograph_if_they_do_not_differ(gains, stays):
     rounds = len(TRAINING) * ROUNDS
-    early, late = (fitted(exposed_views(gains), replace(CONFIG, steps=steps)) for steps in (rounds - 1, rounds))
-    assert early.exposures is not None
-    assert (late.exposures is not None) == stays
-    again = Optimizer(late.adam, late.photographs, TRAINING, CONFIG, prune=PruneConfig(), step=rounds)
-    assert again.exposures is None
-    if late.exposures is not None:
-        maps = late.exposures.maps
-        again = Optimizer(
-            late.adam, late.photographs, TRAINING, CONFIG, prune=PruneConfig(), exposures=maps, step=rounds
-        )
-        assert again.exposures.maps is maps
+    one = fitted(exposed_views(gains), replace(CONFIG, steps=rounds), rounds - 1)
+    one.advance()
+    assert (one.exposures is not None) == stays
+    going_on = partial(Optimizer, one.adam, one.photographs, TRAINING, CONFIG, prune=PruneConfig(), step=rounds)
+    assert going_on().exposures is None
+    if one.exposures is not None:
+        maps = one.exposures.maps
+        assert going_on(exposures=maps).exposures.maps is maps
 
 
 @pytest.mark.slow
 def test_gains_of_photographs_are_found_and_the_held_out_view_gains() -> None:
-    views, config = exposed_views(GAINS), replace(CONFIG, steps=60)
-    on, off = fitted(views, config), fitted(views, replace(config, exposure=False))
+    views = exposed_views(GAINS)
+    on, off = fitted(views, CONFIG, 60), fitted(views, replace(CONFIG, exposure=False), 60)
     assert off.exposures is None
     expected = GAINS[list(TRAINING)] / GAINS[list(TRAINING)].mean()
     np.testing.assert_allclose(on.exposures.brightness().numpy(), expected, atol=0.03)

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from archives import header_of, rewrite
-from command_runs import refusal, results_of
+from command_runs import refusal
 from PIL import Image
 from reconstructions import cut_at
 
-from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
@@ -107,23 +106,6 @@ def test_a_run_of_another_limit_and_one_of_impossible_colors_do_not_go_on(scene:
         reconstruct(scene, short(), work=tmp_path)
 
 
-def test_limits_and_what_became_of_them_are_printed_and_recorded(folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(planning, "MOST_STEPS", STEPS)
-    words = ["reconstruct", str(folder), f"out={tmp_path / 'out'}", "seeds.voxel=0.15", "holdout=3"]
-    words += ["data.image_scale=0.5"]
-    assert cli.main([*words, "budget.seconds=500", "budget.megabytes=0.04"]) == 0
-    printed = capsys.readouterr()
-    results = results_of(tmp_path / "out")
-    budget = results["budget"]
-    assert budget["limits"] == {"seconds": 500.0, "megabytes": 0.04}
-    assert budget["chosen"]["steps"] == STEPS
-    assert budget["chosen"]["image_scale"] == 0.5
-    assert 0 < results["gaussians"] <= budget["chosen"]["most_gaussians"] < 0.04e6 / 68
-    assert budget["measured"]["megabytes"] == (tmp_path / "out" / "splat.ply").stat().st_size / 1e6 <= 0.04
-    assert "budget.megabytes: limit 0.04, measured 0.0" in printed.out
-    assert "budget.seconds: limit 500, measured" in printed.out
-
-
 def test_a_limit_with_an_option_that_it_chooses_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     problem = refusal(capsys, "reconstruct", str(folder), "budget.seconds=60", "preset=exact")
     assert "optimize.steps=3000: is chosen by budget.seconds; leave it (or the preset that sets it) out" in problem
@@ -148,7 +130,7 @@ class Wall:
         return self.now
 
 
-@pytest.mark.parametrize(("seconds", "steps", "elapsed"), [(4.0, 21, 84), (8.0, 13, 104), (2.5, 21, 52.5)])
+@pytest.mark.parametrize(("seconds", "steps", "elapsed"), [(8.0, 13, 104), (2.5, 21, 52.5)])
 def test_the_planned_steps_are_done_and_end_early_where_the_clock_runs_out(scene, monkeypatch, seconds, steps, elapsed):
     lines: list[str] = []
     result = reconstruct(scene, limited(seconds=100.0), now=Wall(monkeypatch, seconds), report=lines.append)

@@ -16,16 +16,7 @@ from torch.nn.functional import interpolate
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import fuse
-from gsencoder.teachers.masks import (
-    Proposal,
-    SamMasks,
-    SamOptions,
-    grid_points,
-    mask_iou,
-    paint,
-    stability,
-    suppress,
-)
+from gsencoder.teachers.masks import Proposal, SamMasks, SamOptions, grid_points, mask_iou, paint, stability, suppress
 from gsencoder.teachers.regions import OnnxRegionOptions, RegionsConfig
 
 SIDE = 64

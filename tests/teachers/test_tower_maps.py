@@ -214,11 +214,10 @@ def test_the_layout_of_published_llava_weights_is_read(saved: Save, tmp_path: Pa
 
 
 @pytest.mark.parametrize("kind", ["clip", "siglip2", "dinov3", "sam"])
-@pytest.mark.parametrize("dense", ["auto"])
-def test_a_tower_in_bfloat16_stays_near_the_one_in_float32(saved: Save, kind: str, dense: Any) -> None:
+def test_a_tower_in_bfloat16_stays_near_the_one_in_float32(saved: Save, kind: str) -> None:
     """As on a GPU, where it runs under autocast."""
     folder, _ = saved(kind)
-    network = VisionTower(folder, tower_in(folder), dense, None)
+    network = VisionTower(folder, tower_in(folder), "auto", None)
     pixels = torch.randn(1, 3, SIDE, SIDE - PATCH, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         exact = network(pixels)
@@ -226,13 +225,3 @@ def test_a_tower_in_bfloat16_stays_near_the_one_in_float32(saved: Save, kind: st
             rounded = network(pixels)
     assert exact.dtype == rounded.dtype == torch.float32
     assert 0 < (rounded - exact).norm() / exact.norm() < 0.05
-
-
-def test_no_part_of_a_picture_is_cut_off(saved: Save) -> None:
-    folder, _ = saved("clip")
-    image = np.zeros((32, 96, 3), np.uint8)
-    changed = image.copy()
-    changed[:, -8:] = 255
-    one, other = (features_of(folder, each, size=96) for each in (image, changed))
-    assert one.shape[:2] == (4, 12)
-    assert np.abs(one - other)[:, -1].max() > 1e-2

@@ -36,7 +36,6 @@ def test_a_scene_without_pictures_is_refused(models: Path) -> None:
     ("kind", "settings", "message"),
     [
         ("clip", {"layer": LAYERS + 1}, r"layer: expected -4 to 3, as this CLIP tower has 3 layers, got 4"),
-        ("clip", {"layer": -LAYERS - 2}, r"layer: expected -4 to 3"),
         ("dinov2", {"dense": "summary"}, "this DINOv2 tower has none; give dense=tokens"),
         ("llava", {"dense": "values"}, "this CLIP tower has none"),
         ("sam", {"size": 64}, "SAM takes pictures of up to 32 pixels, got 64; give large=windows"),
@@ -79,7 +78,6 @@ def test_models_of_other_kinds_are_refused_with_the_kinds_that_are_known(tmp_pat
     ("changes", "message"),
     [
         ({"image_mean": None}, r".*three numbers as image_mean, .* \('image_mean'\); take the file"),
-        ({"image_mean": [0.5, 0.5]}, "expected .*numbers out of range"),
         ({"image_std": [0.5, 0.5, 0.0]}, "expected .*numbers out of range"),
         ({"resample": 9}, "expected a filter of Pillow as resample, .*9"),
         ({"rescale_factor": 0}, "expected .*numbers out of range"),

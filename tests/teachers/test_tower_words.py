@@ -11,6 +11,7 @@ import pytest
 import torch
 import vision_towers
 from command_runs import refusal
+from splats import front_camera
 from text_towers import save_tokenizer
 from vision_towers import save_vision_tower
 
@@ -20,13 +21,13 @@ from gsencoder.app.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features
-from gsencoder.teachers.build import TeacherConfig, words_of
+from gsencoder.teachers.build import words_of
 from gsencoder.teachers.tower import TransformersConfig
 from gsencoder.text import vocabulary as open_vocabulary
 from gsencoder.text.models import TransformersTextConfig
 from gsencoder.text.table import load_text_table, save_text_table
-from gsencoder.text.vocabulary import TextConfig, vocabulary_of, words_of_table
-from gsencoder.types import GaussianFeatures, Scene
+from gsencoder.text.vocabulary import vocabulary_of, words_of_table
+from gsencoder.types import GaussianFeatures, Scene, Views
 
 transformers = pytest.importorskip("transformers")
 
@@ -47,18 +48,11 @@ def save_joint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SaveJoint:
         save_vision_tower(kind, folder)
         save_tokenizer(folder / "tokenizer.json", WORDS)
         transformers.PreTrainedTokenizerFast(
-            tokenizer_file=str(folder / "tokenizer.json"),
-            pad_token="[PAD]",
-            unk_token="[UNK]",
-            model_max_length=12,
+            tokenizer_file=str(folder / "tokenizer.json"), pad_token="[PAD]", unk_token="[UNK]", model_max_length=12
         ).save_pretrained(folder)
         return folder
 
     return save
-
-
-def built(teacher: TeacherConfig, text: TextConfig) -> Any:
-    return teacher.build(Scene(name="s"), words_of(teacher, text))
 
 
 @pytest.mark.parametrize("kind", ["clip", "siglip"])
@@ -75,10 +69,6 @@ def test_one_folder_gives_both_sides_of_a_joint_space(save_joint: SaveJoint, kin
 
 def test_a_summary_of_a_picture_of_one_patch_is_the_pictures_own(save_joint: SaveJoint) -> None:
     """So the joint space is the one in which the model itself compares pictures with text."""
-    from splats import front_camera
-
-    from gsencoder.types import Views
-
     folder = save_joint("siglip")
     model = transformers.SiglipModel.from_pretrained(folder).eval()
     patch = vision_towers.picture(8, 8)
@@ -104,12 +94,11 @@ def test_a_tower_is_refused_for_vectors_that_it_does_not_speak_for(settings: dic
         words_of(TransformersConfig(model="nowhere", **settings), TransformersTextConfig(model="nowhere"))
 
 
-def test_a_text_tower_is_refused_for_a_vision_tower_without_a_joint_space(save_joint, tmp_path):
-    kind = "llava"
+def test_a_text_tower_is_refused_for_a_vision_tower_without_a_joint_space(save_joint, models):
+    teacher = TransformersConfig(model=str(models / "llava"))
     text = TransformersTextConfig(model=str(save_joint("clip")))
-    save_vision_tower(kind, tmp_path / kind)
-    with pytest.raises(InputError, match=f"no words lead into tokens after the final norm of {kind}"):
-        built(TransformersConfig(model=str(tmp_path / kind)), text)
+    with pytest.raises(InputError, match="no words lead into tokens after the final norm of llava"):
+        teacher.build(Scene(name="s"), words_of(teacher, text))
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +117,8 @@ def features_of(folder: Path) -> GaussianFeatures:
 def test_a_scene_is_fused_and_words_are_localized_in_it(room, save_joint, tmp_path, capsys):
     model = save_joint("clip")
     out, boxes = tmp_path / "features", tmp_path / "boxes"
-    fuse = ["fuse", str(room), "teacher=transformers", f"teacher.model={model}", "seeds.voxel=0.1", "quiet=true"]
+    fuse = ["fuse", str(room), "teacher=transformers", f"teacher.model={model}", "teacher.size=48"]
+    fuse += ["seeds.voxel=0.1", "quiet=true"]
     assert cli.main([*fuse, "text=transformers", f"text.model={model}", f"out={out}"]) == 0
     features = features_of(out)
     assert features.space.channels == vision_towers.JOINT_CHANNELS
@@ -141,7 +131,7 @@ def test_a_scene_is_fused_and_words_are_localized_in_it(room, save_joint, tmp_pa
     phrase = ["localize", str(out), "query=red wooden chair", "pictures=0", f"out={tmp_path / 'phrase'}"]
     assert "text tower" in refusal(capsys, *phrase)
     assert cli.main([*phrase, "text=transformers", f"text.model={model}", "quiet=true"]) == 0
-    assert cli.main([*fuse, "teacher.dense=tokens", "teacher.size=48", f"out={tmp_path / 'tokens'}"]) == 0
+    assert cli.main([*fuse, "teacher.dense=tokens", f"out={tmp_path / 'tokens'}"]) == 0
     assert features_of(tmp_path / "tokens").space.channels == vision_towers.SHAPE["hidden_size"]
 
 
@@ -156,10 +146,6 @@ def test_a_scene_is_fused_and_words_are_localized_in_it(room, save_joint, tmp_pa
     ],
 )
 def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str, dense: str, size: int) -> None:
-    from splats import front_camera
-
-    from gsencoder.types import Views
-
     save_vision_tower(kind, tmp_path / kind)
     config = compose("fuse", FuseCommandConfig, ("s", f"teacher={preset}", f"teacher.model={tmp_path / kind}")).teacher
     assert isinstance(config, TransformersConfig)
