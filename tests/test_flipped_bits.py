@@ -155,7 +155,8 @@ def reconstruction(folder: Path) -> Made:
     def read() -> Any:
         got = load_state(folder / "r", {"rate": 0.1}, sh_degree=1)
         assert got.anchor is not None
-        return got.adam.tables(), got.adam.steps, got.anchor, got.exposures, got.step, got.seconds, got.facts
+        tables = [getattr(got.adam, kind) for kind in RowAdam.KINDS]
+        return tables, got.adam.steps, got.anchor, got.exposures, got.step, got.seconds, got.facts
 
     return folder / "r", read
 
