@@ -52,7 +52,8 @@ STRAY_FACTOR = 3.0  # … this many times that of the middle one of the other pa
 STRAY_SHARE = 0.25
 """… this share of their matches is in pairs that fit. It is astray if it has another pose under which two pairs fit
 and …"""
-MOVED_SHARE = 0.5  # … this share of the matches is in pairs that do
+MOVED_SHARE, STRAY_GAIN = 0.5, 3.0
+"""… this share of the matches is in pairs that do, and errors are this many times smaller."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -274,7 +275,7 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
         for error, usual, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
             moved = fit_pose_to_matches(cameras, view, own)
             fitting, after = sum(_fits(moved, pair, limit) for pair in own), mean_error(moved, own)
-            if fitting >= 2 and inlier_share(moved, own, limit) >= MOVED_SHARE and after < error / 2:
+            if fitting >= 2 and inlier_share(moved, own, limit) >= MOVED_SHARE and after < error / STRAY_GAIN:
                 message = (
                     f"its photograph does not fit its pose: its matches lie {error:.1f} pixels from their epipolar "
                     f"lines, {after:.1f} if it is moved, and those of the other views {usual:.1f}"
