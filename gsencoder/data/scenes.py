@@ -55,7 +55,7 @@ from gsencoder.data.readers.rgbd import (
     read_seven_scenes,
     read_tum,
 )
-from gsencoder.data.readers.transforms_json import TRANSFORMS, read_transforms
+from gsencoder.data.readers.transforms_json import OBJECTS_FILE, TRANSFORMS, read_transforms
 from gsencoder.data.splats.files import gaussians_from_raw, is_ply_of_splat, load_splat, read_raw
 from gsencoder.data.video import refuse_video
 from gsencoder.types import Cameras, Gaussians, Scene, Views
@@ -518,6 +518,8 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     if left_over:
         advice = f"say splat={left_over[0]} if it belongs to them"
         _warn(f"{folder}: {left_over[0]} lies with the views and is not used; {advice}")
+    if layout != "transforms.json" and (folder / OBJECTS_FILE).is_file():
+        _warn(f"{folder}: {OBJECTS_FILE} is not used; it names objects of transforms.json, and this is {layout}")
     objects = posed.objects
     labels = labels_of_layout(folder, layout) if layout in ("ScanNet", "ScanNet++") else None
     if labels is not None:

@@ -53,6 +53,13 @@ def test_a_room_is_read_back_from_every_layout(room, tmp_path, layout):
     assert (read.metres_per_unit, read.up is None) == (1.0, layout == "7-Scenes")
 
 
+def test_named_objects_that_a_layout_does_not_read_are_not_passed_over_silently(room, tmp_path):
+    WRITERS["7-Scenes"](room, tmp_path)
+    (tmp_path / "objects.json").write_text("{}")
+    with pytest.warns(SceneWarning, match=r"objects\.json is not used; .* this is 7-Scenes"):
+        assert load_scene(tmp_path).objects == ()
+
+
 def test_the_error_that_recognizes_nothing_lists_every_layout(tmp_path):
     with pytest.raises(InputError, match="neither a scene nor a folder of scenes") as error:
         find_scenes([tmp_path])

@@ -336,10 +336,12 @@ def check_lines(facts: dict[str, Any], depth: DepthCheck | None, matches: Epipol
             )
     if matches is not None:
         if matches.pairs:
+            figures = (
+                f"{matches.share:.0%} within 2 pixels of their epipolar lines, {matches.error:.2f} pixels on average"
+            )
             lines.append(
                 f"{matches.matches:,} matches of {matches.pairs} pairs of {len(matches.views)} of {facts['views']:,} "
-                f"views: {matches.share:.0%} within 2 pixels of their epipolar lines, {matches.error:.2f} pixels on "
-                "average (pictures of at most 640 pixels)"
+                f"views, in pictures of at most 640 pixels{f': {figures}' if matches.decided else ''}"
             )
             if matches.decided and matches.unmatched:
                 lines.append(f"too few matches to tell whether these fit: {listed(matches.unmatched)}")
