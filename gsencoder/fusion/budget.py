@@ -141,7 +141,7 @@ class BudgetFusion:
     predicted: Mapping[str, float]
     choosing: float
     seconds: float
-    teacher: "KeptMaps"
+    teacher: "RecordedMaps"
     notes: tuple[str, ...]
 
 
@@ -172,7 +172,7 @@ def fuse_within(
     if work is not None and not teacher.cheap:
         settings = {"budget": "maps", "lift": config.lift}
         teacher = cached_maps(work, settings, teacher, gaussians, views, range(len(views)), None)
-    maps, count = KeptMaps(teacher), len(views)
+    maps, count = RecordedMaps(teacher), len(views)
     order, sampled = bisection_order(count), None
     if budget.error is not None and not (teacher.cheap and count <= ALL_VIEWS):
         sampled = sample_views(gaussians, views, maps, config.visibility, exact.blend)
@@ -230,7 +230,7 @@ def fuse_within(
     )
 
 
-class KeptMaps(WrappedTeacher):
+class RecordedMaps(WrappedTeacher):
     """A teacher whose maps are kept in memory where it is costly, while a setting is chosen."""
 
     def __init__(self, teacher: Teacher) -> None:
@@ -287,7 +287,7 @@ class SampledViews:
 
 
 def sample_views(
-    gaussians: Gaussians, views: Views, teacher: KeptMaps, visibility: VisibilityConfig, config: BlendConfig
+    gaussians: Gaussians, views: Views, teacher: RecordedMaps, visibility: VisibilityConfig, config: BlendConfig
 ) -> SampledViews:
     """Looks at views on a few rays, and makes some maps."""
     count, spread = len(views), bisection_order(len(views))

@@ -157,7 +157,7 @@ class OnnxTower:
         tokens = next((name for name in TOKEN_OUTPUTS if name in outputs), outputs[0])
         if requested == "auto" and pooled is not None:
             return "output", pooled
-        pooling = stated_pooling(self._folder) if requested == "auto" else requested
+        pooling = declared_pooling(self._folder) if requested == "auto" else requested
         if pooling == "output":
             return "output", pooled or outputs[0]
         if pooling in ("mean", "cls", "eos"):
@@ -208,7 +208,7 @@ def _load_tokenizer(path: Path) -> Any:
         raise InputError(f"{path}: is no tokenizer: {' '.join(str(error).split())[:120]}") from error
 
 
-def stated_pooling(folder: Path) -> str:
+def declared_pooling(folder: Path) -> str:
     """The pooling that sentence-transformers' files state, or nothing."""
     for module in _read_json(folder / "modules.json", list):
         kind = str(module.get("type", "")).rpartition(".")[2] if isinstance(module, dict) else ""
@@ -368,7 +368,7 @@ def canonical(phrase: str) -> str:
 def _choose_pooling(folder: Path, model_type: str, requested: str) -> str:
     if requested != "auto":
         return requested
-    pooling = "output" if model_type in JOINT else stated_pooling(folder)
+    pooling = "output" if model_type in JOINT else declared_pooling(folder)
     if not pooling:
         raise InputError(
             f"{WHAT}: {folder}: no file says how token vectors of a {model_type} model become one "
