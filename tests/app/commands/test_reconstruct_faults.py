@@ -13,12 +13,13 @@ from reconstructions import QUICK, interrupt, never
 
 from gsencoder.app import main as cli
 from gsencoder.reconstruct import run as reconstruct
+from gsencoder.reconstruct import score as scores
 
 pytestmark = pytest.mark.slow
 
 
 def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(room, built, tmp_path, monkeypatch):
-    out, score, calls = tmp_path / "out", reconstruct.score, []
+    out, score, calls = tmp_path / "out", scores.score, []
 
     def cut_off_at_the_last(*arguments: object) -> object:
         calls.append(arguments)
@@ -26,7 +27,7 @@ def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(room, built, 
 
     words = ["reconstruct", str(room), f"out={out}", *QUICK]
     with monkeypatch.context() as patched:
-        patched.setattr(reconstruct, "score", cut_off_at_the_last)
+        patched.setattr(scores, "score", cut_off_at_the_last)
         assert cli.main(words) == 130
     with monkeypatch.context() as patched:
         patched.setattr(reconstruct.Optimizer, "advance", never)

@@ -196,10 +196,10 @@ def test_a_view_without_a_pose_that_fits_is_not_astray(cameras, matches):
     assert astray(cameras, motif) == []
 
 
-def test_a_pose_that_does_not_halve_the_error_is_none_of_a_view_astray(cameras, matches):
-    """Two of three pairs fit it; the third, 20 pixels off and more, fits neither."""
+def test_a_pose_with_more_than_a_third_of_the_error_is_none_of_a_view_astray(cameras, matches):
+    """Two of three pairs fit it; the third, ten pixels off, fits neither."""
     pairs = {(pair.first, pair.second): pair for pair in matches if pair.second < 4}
-    far = np.random.default_rng(0).normal(size=(60, 2)) * 1e4
+    far = np.random.default_rng(0).normal(size=(60, 2)) * 16
     pairs[0, 3] = replace(pairs[0, 3], second_pixels=pairs[0, 3].second_pixels + far)
     for error, named in ((8.5, []), (17.0, ["0.png"])):
         wrong = turned_to_error(cameras, [pairs[0, 1], pairs[0, 2]], 0, error)
