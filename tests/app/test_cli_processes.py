@@ -125,7 +125,7 @@ def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code:
     assert list(tmp_path.iterdir()) == []
 
 
-GIVEN = {"ask": ["features", "question=where"], "score": ["answers", "predictions=answers.json"], "demo": []}
+GIVEN = {"ask": ["features", "question=where"], "score": ["answers", "predictions=a.json", "truth=b.json"], "demo": []}
 """What a command needs to come as far as its start."""
 
 
