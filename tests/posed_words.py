@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from feature_fields import plain_features
 from jaxtyping import Float64
 from memory_samples import make_memory
 from rooms import merged
@@ -55,6 +56,10 @@ def scene_of(gaussians: Gaussians, features: GaussianFeatures, origin: tuple[flo
     return Scene(name="toy", gaussians=gaussians, features={"toy": features}, origin=np.array(origin, np.float64))
 
 
+def ball_scene(kind: str = "basis", origin: tuple[float, float, float] = (0, 0, 0), n: int = 400) -> Scene:
+    return scene_of(opaque_ball(n), some_features(n, kind), origin)
+
+
 def plain_relevancy(
     scene: Scene, cameras: Cameras, text: TextTable, names: tuple[str, ...]
 ) -> Float64[np.ndarray, "Q P"]:
@@ -84,13 +89,7 @@ def two_kinds(first: Gaussians, second: Gaussians) -> tuple[Gaussians, GaussianF
     joined = merged(first, second)
     kinds = np.repeat([0, 1], [len(first), len(second)])
     # The means of features and words are far from both, so that neither is the mean's opposite of the other.
-    features = GaussianFeatures(
-        features=words().encode(NAMES[:2])[kinds],
-        weights=np.ones(len(joined), np.float32),
-        mean=words().mean,
-        space=SPACE,
-    )
-    return joined, features
+    return joined, plain_features(words().encode(NAMES[:2])[kinds], SPACE, mean=words().mean)
 
 
 def memory_of(n: int, *, components: int = 9, scoring: Scoring = "centered") -> QueryMemory:

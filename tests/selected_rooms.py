@@ -6,13 +6,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from feature_fields import plain_features
 from splats import gaussians_at
 
 from gsencoder.app.commands.select import LABELS_JSON, LABELS_PLY, PROPERTY
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.splats.files import load_property, load_splat
 from gsencoder.text.table import TextTable, make_text_table
-from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
+from gsencoder.types import Cameras, FeatureSpace, Gaussians, Scene, Views
 
 NAMES = ("mug", "book", "table", "lamp")
 EMBEDDINGS = np.eye(4, 8, dtype=np.float32)
@@ -63,12 +64,7 @@ def selected_room(*, under: bool = True) -> tuple[Scene, np.ndarray]:
     low = (kinds == 0) & (means[:, 2] < 0.015)
     vectors[near] = 0.3 * EMBEDDINGS[0] + 0.7 * EMBEDDINGS[2]
     vectors[low] = 0.65 * EMBEDDINGS[0] + 0.35 * EMBEDDINGS[2]
-    features = GaussianFeatures(
-        features=vectors.astype(np.float32),
-        weights=np.ones(len(means), np.float32),
-        mean=EMBEDDINGS[:3].mean(axis=0),
-        space=SPACE,
-    )
+    features = plain_features(vectors, SPACE, mean=EMBEDDINGS[:3].mean(axis=0))
     cameras = circling()
     views = Views(cameras=cameras, names=tuple(f"frame {number:02d}" for number in range(len(cameras))))
     scene = Scene(

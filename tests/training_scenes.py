@@ -1,6 +1,6 @@
 """Small scenes with a teacher, prepared for training, that several test files stand on."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -146,10 +146,8 @@ Prepared = tuple[PreparedDataset, list[str]]
 
 
 def trainer(dataset: Prepared, folder: Path, config: TrainerConfig = SHORT, **changes: object) -> Trainer:
-    folder.mkdir(exist_ok=True)
-    return encoder_trainer(
-        small_encoder(), samples(*dataset), LOSSES, config, folder=folder, settings={"run": 1}, **changes
-    )
+    changes |= {"folder": made(folder), "settings": {"run": 1}}
+    return encoder_trainer(small_encoder(), samples(*dataset), LOSSES, config, **changes)
 
 
 def losses(folder: Path, column: str = "loss") -> list[float]:
@@ -177,3 +175,20 @@ def assert_same_weights(one: Path, other: Path) -> None:
     assert first.keys() == second.keys()
     for name, value in first.items():
         np.testing.assert_array_equal(value, second[name])
+
+
+def made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def stop_at(last: int, error: BaseException | None = None) -> Callable[[range, str], Iterator[int]]:
+    """Goes through the steps of a run, and interrupts it before one of them."""
+
+    def track(steps: range, label: str) -> Iterator[int]:
+        for step in steps:
+            if step == last:
+                raise error or KeyboardInterrupt
+            yield step
+
+    return track

@@ -8,7 +8,6 @@ import numpy as np
 from PIL import Image
 from tiny_vlm import SIDE, save_tiny_vlm
 
-from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.data.prompts import PromptStore
 from gsencoder.train.loop import TrainerConfig
 from gsencoder.train.tune import PairSamples, TuneConfig, TuningPair, TuningSample, open_processor
@@ -54,15 +53,6 @@ def make_model(folder: Path) -> Path:
 
 
 Pairs = tuple[list[TuningPair], PromptStore]
-
-
-def made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def losses(folder: Path) -> list[float]:
-    return [float(row["loss"]) for row in read_log(folder / LOG_FILE)]
 
 
 def samples(pairs: Pairs, model: Path, **changes: Any) -> PairSamples:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from field_scenes import FieldRoom, write_transforms
 from scipy.spatial.transform import Rotation
+from splats import random_gaussians
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import SceneConfig, load_scene
@@ -30,12 +31,8 @@ from gsencoder.fusion.fit import (
 from gsencoder.geometry import colors_from_sh
 from gsencoder.types import Gaussians, Scene
 
-NERFSTUDIO = SplatFrame(
-    name="s",
-    rotation=Rotation.from_euler("xyz", (0.2, -0.4, 0.6)).as_matrix(),
-    shift=np.array([0.3, -0.2, 1.1]),
-    scale=1 / 0.37,
-)
+TURN = Rotation.from_euler("xyz", (0.2, -0.4, 0.6)).as_matrix()
+NERFSTUDIO = SplatFrame(name="s", rotation=TURN, shift=np.array([0.3, -0.2, 1.1]), scale=1 / 0.37)
 ORIGIN = np.zeros(3)
 
 
@@ -108,15 +105,8 @@ def test_moving_the_cameras_shows_what_moving_the_splat_does(scene: Scene) -> No
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_moved_splat_has_the_colors_that_it_had_from_there(degree: int) -> None:
-    rng = np.random.default_rng(degree)
-    count = 20
-    splat = Gaussians(
-        means=rng.normal(size=(count, 3)).astype(np.float32),
-        quats=Rotation.random(count, random_state=0).as_quat(scalar_first=True).astype(np.float32),
-        scales=np.full((count, 3), 0.1, np.float32),
-        opacities=np.full(count, 0.5, np.float32),
-        sh=(0.1 * rng.normal(size=(count, (degree + 1) ** 2, 3))).astype(np.float32),
-    )
+    splat = random_gaussians(20, degree=degree, center=(0, 0, 0))
+    splat = replace(splat, sh=np.float32(0.1) * splat.sh)
     placed = moved(splat, NERFSTUDIO, ORIGIN)
     eye = np.array([4.0, 1.0, -2.0])
     seen_from = NERFSTUDIO.scale * NERFSTUDIO.rotation @ eye + NERFSTUDIO.shift

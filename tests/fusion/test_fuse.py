@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fixed_teachers import EXACT, SPACE, CodedTeacher, FixedTeacher, make_scene
+from rooms import merged
 from splats import one_gaussian, random_gaussians
 
 from gsencoder.core.errors import InputError
@@ -93,9 +94,7 @@ def test_coded_maps_are_the_same_as_their_vectors(rng: np.random.Generator) -> N
 
 def two_walls() -> Gaussians:
     near, far = one_gaussian((0, 0, 2), (3.0, 3.0, 0.01), 1.0), one_gaussian((0, 0, 4), (6.0, 6.0, 0.01), 1.0)
-    return Gaussians(
-        **{name: np.concatenate((getattr(near, name), getattr(far, name))) for name in Gaussians.__dataclass_fields__}
-    )
+    return merged(near, far)
 
 
 @pytest.mark.parametrize("against", ["rendered", "sensor"])
@@ -109,24 +108,18 @@ def test_the_center_lift_sees_a_hidden_wall_unless_an_occlusion_test_hides_it(ag
     assert fuse(scene, FixedTeacher(maps), tested).features.weights.tolist() == [1, 0]
 
 
-@pytest.mark.parametrize(
-    ("lift", "sensor", "tested"),
-    [
-        ("blend", True, ("sensor",)),
-        ("center", True, ("sensor",)),
-        ("blend", False, ()),
-        ("center", False, ("rendered",)),
-    ],
-)
+TESTS = [(lift, True, ("sensor",)) for lift in ("blend", "center")]
+TESTS += [("blend", False, ()), ("center", False, ("rendered",))]
+
+
+@pytest.mark.parametrize(("lift", "sensor", "tested"), TESTS)
 def test_the_automatic_test_takes_the_depth_that_there_is(lift, sensor, tested, rng):
     depths = {"depths": [np.full((24, 32), 2.0, np.float32)]} if sensor else {}
-    scene = make_scene(count=1, gaussians=two_walls(), **depths)
+    scene, teacher = make_scene(count=1, gaussians=two_walls(), **depths), FixedTeacher(random_maps(rng)[:1])
     config = FuseConfig(lift=lift, energy=1.0)  # type: ignore[arg-type]
-    fusion = fuse(scene, FixedTeacher(random_maps(rng)[:1]), config)
+    fusion = fuse(scene, teacher, config)
     assert fusion.depth_sources == tested
-    named = fuse(
-        scene, FixedTeacher(random_maps(rng)[:1]), replace(config, visibility=VisibilityConfig(against=tested))
-    )
+    named = fuse(scene, teacher, replace(config, visibility=VisibilityConfig(against=tested)))
     assert (fusion.features.weights == named.features.weights).all()
 
 

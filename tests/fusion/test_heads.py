@@ -77,16 +77,8 @@ def test_heads_that_are_read_are_those_that_were_written(tmp_path: Path) -> None
     assert heads_digest(replace(heads, space=replace(SPACE, weights="other"))) != heads_digest(heads)
 
 
-GOOD = {
-    "name": "a.summary",
-    "text": "",
-    "model": "",
-    "layers": ["linear"],
-    "scale": 1.0,
-    "cells": 1,
-    "cosine": 1.0,
-    "worst": 1.0,
-}
+GOOD = {"name": "a.summary", "text": "", "model": "", "layers": ["linear"], "cells": 1}
+GOOD |= dict.fromkeys(("scale", "cosine", "worst"), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -159,12 +151,11 @@ def test_a_sample_holds_evenly_spaced_cells_that_have_a_vector() -> None:
     sample = CellSample(maps=2, limit=20)
     sample.add(feature_map(values))
     np.testing.assert_array_equal(sample.vectors(), values.reshape(-1, 6)[1::10])
-    with pytest.raises(InputError, match="no view has a cell with a vector"):
-        CellSample(1).vectors()
     empty = CellSample(1)
-    empty.add(feature_map(np.full((2, 2, 6), np.nan, np.float32)))
-    with pytest.raises(InputError, match="no view has a cell with a vector"):
-        empty.vectors()
+    for _ in range(2):
+        with pytest.raises(InputError, match="no view has a cell with a vector"):
+            empty.vectors()
+        empty.add(feature_map(np.full((2, 2, 6), np.nan, np.float32)))
 
 
 def a_basis(rank: int) -> FeatureBasis:
@@ -226,15 +217,8 @@ def test_features_through_a_head_are_its_outputs_for_the_decoded_vectors(rank: i
     assert not made.features[~seen].any()
     np.testing.assert_array_equal(made.weights, features.weights)
     np.testing.assert_array_equal(made.mean, head.mean)
-    assert made.space == FeatureSpace(
-        name="radio/siglip.summary",
-        channels=4,
-        teacher="radio",
-        weights="abcd",
-        layer="siglip.summary",
-        preprocessing="resized",
-        text_encoder="tower",
-    )
+    names = {"name": "radio/siglip.summary", "layer": "siglip.summary", "text_encoder": "tower"}
+    assert made.space == replace(SPACE, channels=4, **names)
 
 
 def test_tokens_go_through_a_head_one_by_one() -> None:

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rooms import UP, merged
+from splats import gaussians_at
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.cameras import _cover, interior_views, with_views
 from gsencoder.types import Gaussians, Scene
-
-UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.fixture(autouse=True)
@@ -20,24 +20,14 @@ def _fewer_positions(monkeypatch: pytest.MonkeyPatch) -> None:
 def box_of_discs(rng: np.random.Generator, size: tuple[float, float, float], count: int = 6000) -> Gaussians:
     """Flat Gaussians on the six sides of a box around the origin."""
     half = np.array(size) / 2
-    axis = rng.choice(
-        3,
-        count,
-        p=np.array([half[1] * half[2], half[0] * half[2], half[0] * half[1]])
-        / (half[1] * half[2] + half[0] * half[2] + half[0] * half[1]),
-    )
+    areas = half.prod() / half
+    axis = rng.choice(3, count, p=areas / areas.sum())
     means = rng.uniform(-half, half, (count, 3))
     rows = np.arange(count)
     means[rows, axis] = half[axis] * rng.choice([-1, 1], count)
     scales = np.full((count, 3), 0.08)
     scales[rows, axis] = 0.002
-    return Gaussians(
-        means=means.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=scales.astype(np.float32),
-        opacities=np.full(count, 0.9, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-    )
+    return gaussians_at(means, scales, 0.9)
 
 
 @pytest.mark.parametrize("up", [None, UP])
@@ -74,9 +64,7 @@ def test_a_splat_without_any_room_refuses_cameras_inside(rng: np.random.Generato
 def test_where_cameras_stand_can_be_stated(rng: np.random.Generator) -> None:
     walls, shelf = box_of_discs(rng, (5.0, 4.0, 2.5)), box_of_discs(rng, (2.0, 0.02, 1.5), 400)
     shelf = replace(shelf, means=shelf.means + np.float32([0.3, 0.4, -0.4]))
-    names = ("means", "quats", "scales", "opacities", "sh")
-    both = {name: np.concatenate((getattr(walls, name), getattr(shelf, name))) for name in names}
-    scene = Scene(name="room", gaussians=Gaussians(**both), up=UP)
+    scene = Scene(name="room", gaussians=merged(walls, shelf), up=UP)
     for cameras, begin in (("auto", "inside_000"), ("inside", "inside_000"), ("around", "orbit_000")):
         views = with_views(scene, 6, cameras=cameras)[0].views  # type: ignore[arg-type]
         assert views.names[0] == begin

@@ -6,31 +6,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from feature_fields import make_features
-from splats import front_camera, random_gaussians
+from feature_fields import make_features, make_scene
 
 from gsencoder.app import main as cli
 from gsencoder.fusion.basis import field_error
 from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.package import PACKAGE_FILE
 from gsencoder.memory import index as index_budget
-from gsencoder.types import GaussianFeatures, Scene, Views
+from gsencoder.types import GaussianFeatures
 
 N = 2000
 FORMS = ("compact", "index")
 
 Pack = Callable[..., dict[str, Any]]
-
-
-def make_scene() -> Scene:
-    return Scene(
-        name="room",
-        gaussians=random_gaussians(N),
-        views=Views(cameras=front_camera(), names=("a",)),
-        origin=np.zeros(3),
-    )
 
 
 @pytest.fixture
@@ -40,7 +29,7 @@ def features() -> GaussianFeatures:
 
 @pytest.fixture
 def folder(tmp_path: Path, features: GaussianFeatures) -> Path:
-    save_features(tmp_path / "features", make_scene(), features)
+    save_features(tmp_path / "features", make_scene(N), features)
     return tmp_path / "features"
 
 

@@ -11,9 +11,9 @@ from typing import Any
 import gsply
 import numpy as np
 import pytest
-from feature_fields import make_features
+from feature_fields import make_features, make_scene
 from safetensors.numpy import load_file
-from splats import front_camera, random_gaussians
+from splats import random_gaussians
 
 from gsencoder.app import main as cli
 from gsencoder.core.archive import open_archive, write_archive
@@ -22,20 +22,12 @@ from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
 from gsencoder.text.table import WORDS_FILE, make_text_table, save_text_table
-from gsencoder.types import GaussianFeatures, Scene, Views
+from gsencoder.types import GaussianFeatures
 
 N = 600
 
 
-def make_scene(origin: float = 1e6) -> Scene:
-    return Scene(
-        name="room",
-        gaussians=random_gaussians(N),
-        views=Views(cameras=front_camera(), names=("a",)),
-        origin=origin * np.array([1.0, -2, 3]),
-        metres_per_unit=0.5,
-        up=np.array([0.0, 0, 1]),
-    )
+ORIGIN = (1e6, -2e6, 3e6)
 
 
 @pytest.fixture
@@ -47,13 +39,13 @@ def features() -> GaussianFeatures:
 def package(tmp_path: Path, features: GaussianFeatures) -> Path:
     folder = tmp_path / "package"
     folder.mkdir()
-    save_package(folder, make_scene(), features, error=0.01)
+    save_package(folder, make_scene(N, ORIGIN), features, error=0.01)
     return folder
 
 
-@pytest.mark.parametrize("origin", [0.0, 1e6])
-def test_a_package_holds_scene_and_features(tmp_path: Path, features: GaussianFeatures, origin: float) -> None:
-    scene = make_scene(origin)
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), ORIGIN])
+def test_a_package_holds_scene_and_features(tmp_path: Path, features: GaussianFeatures, origin: tuple) -> None:
+    scene = make_scene(N, origin)
     made = save_package(tmp_path, scene, features, error=0.01)
     loaded = load_features(tmp_path)
     got = loaded.features["s"]
@@ -93,7 +85,7 @@ def test_a_flipped_bit_anywhere_is_noticed(package: Path) -> None:
 
 def test_features_of_another_splat_are_refused(package: Path) -> None:
     other = replace(random_gaussians(N), opacities=np.full(N, 0.5, np.float32))
-    save_splat(package / SPLAT_FILE, other, origin=make_scene().origin)
+    save_splat(package / SPLAT_FILE, other, origin=make_scene(N, ORIGIN).origin)
     with pytest.raises(InputError, match="the features belong to splat"):
         load_features(package)
     (package / SPLAT_FILE).unlink()
@@ -133,7 +125,7 @@ def folder(tmp_path: Path, features: GaussianFeatures) -> Path:
     """A folder as `fuse` and `encode` leave it."""
     folder = tmp_path / "features"
     folder.mkdir()
-    save_features(folder, make_scene(0.0), features, {})
+    save_features(folder, make_scene(N), features, {})
     table = make_text_table(["mug", "chair"], np.linalg.qr(np.random.default_rng(0).normal(size=(12, 2)))[0].T, "words")
     save_text_table(folder / WORDS_FILE, table)
     return folder

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from archives import header_of, rewrite
+from feature_fields import SPACE, make_features, make_scene
 from memory_samples import make_memory
 from safetensors.numpy import load_file
-from splats import front_camera, random_gaussians
+from splats import random_gaussians
 
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
@@ -21,43 +22,19 @@ from gsencoder.fusion.folder import (
     save_features,
     save_memories,
 )
-from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, QueryMemory, Scene, Views
+from gsencoder.types import FeatureBasis, FeatureSpace, QueryMemory, Scene
 
-SPACE = FeatureSpace(name="s", channels=8, teacher="test", text_encoder="words")
-
-
-def make_scene(n: int = 40) -> Scene:
-    return Scene(
-        name="room",
-        gaussians=random_gaussians(n),
-        views=Views(cameras=front_camera(), names=("a",)),
-        origin=np.array([1e6, -2e6, 3.0]),
-        metres_per_unit=0.5,
-        up=np.array([0.0, 0, 1]),
-    )
+N = 40
 
 
-def make_features(n: int = 40, magnitude: float = 1.0, basis: bool = True) -> GaussianFeatures:
-    rng = np.random.default_rng(0)
-    values = rng.normal(size=(n, 3 if basis else 8)) * magnitude
-    weights = rng.uniform(0.5, 9, size=n).astype(np.float32)
-    weights[::4] = 0
-    values[::4] = 0
-    mean = rng.normal(size=8).astype(np.float32)
-    components = np.linalg.qr(rng.normal(size=(8, 3)))[0].T.astype(np.float32)
-    return GaussianFeatures(
-        features=values.astype(np.float32),
-        weights=weights,
-        mean=mean,
-        space=SPACE,
-        basis=FeatureBasis(mean=mean, components=components, energy_kept=0.9, space=SPACE) if basis else None,
-    )
+def saved(folder: Path) -> None:
+    save_features(folder, make_scene(N), make_features(N, rank=3), {})
 
 
 @pytest.mark.parametrize("basis", [True, False])
 @pytest.mark.parametrize("magnitude", [1e-8, 1e6])
 def test_scene_and_features_come_back_within_half_precision(tmp_path: Path, magnitude: float, basis: bool) -> None:
-    scene, features = make_scene(), make_features(magnitude=magnitude, basis=basis)
+    scene, features = make_scene(N, (1e6, -2e6, 3.0)), make_features(N, 3, magnitude, basis)
     save_features(tmp_path, scene, features, {"lift": "blend"})
     loaded = load_features(tmp_path)
     got = loaded.features["s"]
@@ -76,7 +53,7 @@ def test_scene_and_features_come_back_within_half_precision(tmp_path: Path, magn
 @pytest.mark.parametrize("name", [SCENE_FILE, FEATURES_FILE])
 @pytest.mark.parametrize("keep", [7, 900])
 def test_truncated_files_are_errors(tmp_path: Path, name: str, keep: int) -> None:
-    save_features(tmp_path, make_scene(), make_features(), {})
+    saved(tmp_path)
     content = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(content[:keep])
     with pytest.raises(InputError, match="damaged"):
@@ -91,12 +68,12 @@ def test_missing_folders_and_files_say_what_is_missing(tmp_path: Path) -> None:
 
 
 def test_features_that_are_not_finite_are_not_stored(tmp_path: Path) -> None:
-    features = make_features()
-    features.features[1, 0] = np.nan
-    with pytest.raises(InputError, match="1 of 30 rows are not finite"):
-        save_features(tmp_path, make_scene(), features, {})
+    features = make_features(N)
     with pytest.raises(InputError, match="need as many Gaussians"):
-        save_features(tmp_path, make_scene(39), make_features(), {})
+        save_features(tmp_path, make_scene(N - 1), features, {})
+    features.features[1, 0] = np.nan
+    with pytest.raises(InputError, match="1 of 32 rows are not finite"):
+        save_features(tmp_path, make_scene(N), features, {})
 
 
 def changed(path: Path, **arrays: np.ndarray) -> None:
@@ -107,17 +84,17 @@ def changed(path: Path, **arrays: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("name", "values", "problem"),
     [
-        ("rows", np.zeros(30, np.int32), "row numbers that rise"),
+        ("rows", np.zeros(32, np.int32), "row numbers that rise"),
         ("rows", np.arange(29, dtype=np.int32), r"expected features float16|expected weights float32\[29\]"),
-        ("weights", np.zeros(30, np.float32), "weights above 0"),
-        ("weights", np.full(30, np.nan, np.float32), "not finite"),
+        ("weights", np.zeros(32, np.float32), "weights above 0"),
+        ("weights", np.full(32, np.nan, np.float32), "not finite"),
         ("channel_scale", -np.ones(3, np.float32), "channel_scale and weights above 0"),
         ("mean", np.zeros(7, np.float32), r"expected components float32\[3, 7\]"),
-        ("components", np.full((3, 8), np.inf, np.float32), "24 of 24 values of components are not finite"),
+        ("components", np.full((3, 12), np.inf, np.float32), "36 of 36 values of components are not finite"),
     ],
 )
 def test_features_that_do_not_belong_together_are_named(tmp_path, name, values, problem):
-    save_features(tmp_path, make_scene(), make_features(), {})
+    saved(tmp_path)
     changed(tmp_path / FEATURES_FILE, **{name: values})
     with pytest.raises(InputError, match=f"{FEATURES_FILE}: .*({problem})"):
         load_features(tmp_path)

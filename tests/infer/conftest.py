@@ -11,6 +11,7 @@ import onnx
 import pytest
 import torch
 from symbolic import symbolic_sizes
+from training_scenes import SMALL
 
 from gsencoder.app import main as cli
 from gsencoder.infer.torch_network import TorchNetwork
@@ -20,14 +21,7 @@ from gsencoder.models.transformer import TransformerConfig
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace
 
-SHAPE = TransformerConfig(
-    encoder_depths=(1, 1),
-    encoder_channels=(16, 32),
-    decoder_depths=(1,),
-    decoder_channels=(16,),
-    head_channels=8,
-    patch=24,
-)
+SHAPE = replace(SMALL.transformer, head_channels=8, patch=24, drop_path=TransformerConfig().drop_path)
 
 
 @pytest.fixture(scope="session")
@@ -39,12 +33,8 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     table = replace(table, trained=("mug", "plant"))
     space = FeatureSpace(name="six", channels=6, teacher="labels", text_encoder="words-6", preprocessing="none")
     mean = rng.normal(size=6).astype(np.float32)
-    basis = FeatureBasis(
-        mean=mean,
-        components=np.linalg.qr(rng.normal(size=(6, 4)))[0].T.astype(np.float32),
-        energy_kept=0.9,
-        space=space,
-    )
+    components = np.linalg.qr(rng.normal(size=(6, 4)))[0].T.astype(np.float32)
+    basis = FeatureBasis(mean=mean, components=components, energy_kept=0.9, space=space)
     torch.manual_seed(0)
     encoder = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), 4)
     outputs = OutputSpace(space=space, mean=mean, scale=2.0, basis=basis)

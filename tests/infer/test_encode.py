@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rooms import merged
 from splats import random_gaussians
 from training_scenes import SMALL
 
@@ -166,19 +167,14 @@ def test_chunks_that_take_many_times_the_work_of_a_scene_are_warned_of_with_thei
     chunks = cut(one.means, 200, 0.5)
     seen, narrow = sum(len(each.rows) for each in chunks), sum(each.halo < 0.495 for each in chunks)
     assert 0 < narrow < len(chunks)
+    work = f"take about {(seen + 200 * len(chunks)) / 1500:.0f} times the work .* the 1,500 of the scene"
     figures = (
-        rf"^encode.chunk=200: {len(chunks):,} chunks, .* hold {seen:,} Gaussians, take about "
-        rf"{(seen + 200 * len(chunks)) / 1500:.0f} times the work .* the 1,500 of the scene; {narrow} of them have no "
-        r"room for a halo of 0.25 m.*larger encode.chunk="
+        f"^encode.chunk=200: {len(chunks):,} chunks, .* hold {seen:,} Gaussians, {work}; {narrow} of them have no "
     )
+    figures += "room for a halo of 0.25 m.*larger encode.chunk="
     with pytest.warns(SceneWarning, match=figures) as caught:
         seen_by(one, EncodeConfig(chunk=200, halo=0.25), 0.5)
     assert len(caught) == 1
-
-
-def joined(*splats: Gaussians) -> Gaussians:
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return Gaussians(**{name: np.concatenate([getattr(one, name) for one in splats]) for name in names})
 
 
 def moved(one: Gaussians, x: float) -> Gaussians:
@@ -196,9 +192,8 @@ def test_regions_are_touching_cells_and_the_small_ones_are_one(count: int, least
     """As a flood fill finds them."""
     rng = np.random.default_rng(seed)
     voxel, edge = 0.1, 0.1 * module.REGION_CELL
-    means = (rng.integers(0, 5, (count, 3)) * edge * (2, 1, 1) + rng.uniform(0, edge, (count, 3)) + far).astype(
-        np.float32
-    )
+    means = rng.integers(0, 5, (count, 3)) * edge * (2, 1, 1) + rng.uniform(0, edge, (count, 3)) + far
+    means = means.astype(np.float32)
     cells = [tuple(cell) for cell in np.floor(means.astype(np.float64) / edge).astype(int)]
     unseen, components = set(cells), []
     while unseen:
@@ -227,7 +222,7 @@ def test_rooms_that_are_far_apart_have_the_bits_that_each_has_alone(chunk: int) 
     """Among strays, and with their rows mixed."""
     parts = [random_gaussians(1500), moved(random_gaussians(1100, 1), 100), strays(3)]
     part_of = np.random.default_rng(0).permutation(np.repeat(range(3), [len(part) for part in parts]))
-    mixed = joined(*parts).select(np.argsort(np.argsort(part_of, kind="stable")))
+    mixed = merged(*parts).select(np.argsort(np.argsort(part_of, kind="stable")))
     config, network = replace(WHOLE, chunk=chunk, halo=0.3), encoder()
     features = encode(mixed, network, config).features
     for number, part in enumerate(parts):
@@ -239,7 +234,7 @@ def test_what_is_one_region_is_encoded_as_it_is() -> None:
     line = random_gaussians(2000)
     line = replace(line, means=np.arange(2000, dtype=np.float32)[:, None] * np.float32([10, 0, 0]))
     at_one_place = replace(line, means=np.zeros_like(line.means))
-    halls = joined(*(moved(random_gaussians(99, seed), 100 * seed) for seed in range(5)))
+    halls = merged(*(moved(random_gaussians(99, seed), 100 * seed) for seed in range(5)))
     for scene in (random_gaussians(1500), random_gaussians(1), at_one_place, line, halls):
         (seen,) = seen_by(scene)
         assert seen is scene
@@ -247,19 +242,18 @@ def test_what_is_one_region_is_encoded_as_it_is() -> None:
 
 def test_twenty_rooms_are_encoded_one_by_one_and_all_strays_together() -> None:
     rooms = [moved(random_gaussians(1000 + seed, seed), 100 * seed) for seed in range(20)]
-    assert [len(one) for one in seen_by(joined(*rooms, strays(50)))] == [*range(1000, 1020), 50]
+    assert [len(one) for one in seen_by(merged(*rooms, strays(50)))] == [*range(1000, 1020), 50]
 
 
 def test_a_stray_is_no_reason_to_refuse_a_room_though_it_lies_further_than_cells_can_be_numbered() -> None:
     room = random_gaussians(1500)
     for far in (1e6, 1e12, 3e38):
-        assert [len(one) for one in seen_by(joined(room, moved(random_gaussians(1), far)))] == [1500, 1]
+        assert [len(one) for one in seen_by(merged(room, moved(random_gaussians(1), far)))] == [1500, 1]
 
 
 def test_a_rerun_gives_the_same_bits() -> None:
-    one = random_gaussians(300)
-    config = EncodeConfig(chunk=100)
-    assert np.array_equal(encode(one, encoder(), config).features, encode(one, encoder(), config).features)
+    one, two = (encode(random_gaussians(300), encoder(), EncodeConfig(chunk=100)).features for _ in range(2))
+    assert np.array_equal(one, two)
 
 
 @pytest.mark.parametrize("unit", [0.0, float("nan")])

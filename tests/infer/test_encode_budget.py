@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from feature_fields import plain_features
+from rooms import merged
 from splats import random_gaussians
 
 from gsencoder.app import main as cli
@@ -97,9 +99,7 @@ def test_where_error_and_other_budgets_conflict_the_error_is_kept_and_each_confl
 
 def test_rooms_that_are_far_apart_are_chosen_for_as_they_are_encoded_and_each_as_if_alone(gaussians, encoder):
     """Of two that fit into a chunk each, and not together, there is nothing to cut; of a larger chunk's there is."""
-    names = ("means", "quats", "scales", "opacities", "sh")
-    far = replace(gaussians, means=gaussians.means + np.float32([1000, 0, 0]))
-    both = Gaussians(**{name: np.concatenate((getattr(gaussians, name), getattr(far, name))) for name in names})
+    both = merged(gaussians, replace(gaussians, means=gaussians.means + np.float32([1000, 0, 0])))
     made = within(both, encoder, EncodeConfig(chunk=len(gaussians)), error=1e-7)
     assert made.choice.setting.halo == made.exact.halo
     alone = encoder.encode_spaces(gaussians, made.exact)["labels"].features
@@ -209,20 +209,14 @@ class NearSighted(Encoder):
         self, gaussians: Gaussians, config: EncodeConfig = EncodeConfig(), *, metres_per_unit: float = 1.0, **_: Any
     ) -> dict[str, GaussianFeatures]:
         chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
-        angles = np.exp(-4 * seen_around(gaussians.means, chunks) * metres_per_unit) + 0.1 * (
-            config.precision == "bfloat16"
-        )
+        angles = np.exp(-4 * seen_around(gaussians.means, chunks) * metres_per_unit)
+        angles += 0.1 * (config.precision == "bfloat16")
         x, y, z, w = (gaussians.quats * np.array([1, 1, 0.3, 0.3])).T
         made = {}
         for name, times in (("single", 1), ("double", 2)):
             c, s = np.cos(times * angles), np.sin(times * angles)
             turned = np.stack([c * x - s * y, s * x + c * y, c * z - s * w, s * z + c * w], axis=1)
-            made[name] = GaussianFeatures(
-                features=turned.astype(np.float32),
-                weights=np.ones(len(gaussians), np.float32),
-                mean=np.zeros(4, np.float32),
-                space=self.spaces[name],
-            )
+            made[name] = plain_features(turned, self.spaces[name])
         return made
 
 
@@ -239,9 +233,8 @@ def test_a_splat_in_other_units_of_length_gets_the_same_setting_and_the_same_err
     for one, unit in ((gaussians, 1.0), (quarters, 0.25)):
         sample = sampled(one, unit=unit)
         errors = [sample.error(setting) for setting in sample.settings]
-        encoding = encode_within(
-            one, NearSighted(), ["double"], IN_CHUNKS, EncodeBudget(error=0.9), metres_per_unit=unit
-        )
+        budget = EncodeBudget(error=0.9)
+        encoding = encode_within(one, NearSighted(), ["double"], IN_CHUNKS, budget, metres_per_unit=unit)
         assert encoding.choice.setting != encoding.exact
         error = realised_error(encoding, one, NearSighted(), metres_per_unit=unit)["double"].total
         made.append((errors, encoding.choice.setting, encoding.features["double"].features.tolist(), error))
@@ -302,8 +295,7 @@ def test_megabytes_are_those_of_the_files_of_all_teachers_together(gaussians: Ga
 def test_a_setting_and_the_coordinates_left_out_share_the_limit_of_error(gaussians, monkeypatch):
     monkeypatch.setattr(module, "SMALL_SCENE", 0)
     for error in (0.05, 0.2, 0.45):
-        made = encode_within(
-            gaussians, NearSighted(), ["single"], EncodeConfig(), EncodeBudget(error=error, megabytes=1e-6)
-        )
+        budget = EncodeBudget(error=error, megabytes=1e-6)
+        made = encode_within(gaussians, NearSighted(), ["single"], EncodeConfig(), budget)
         left_out = made.predicted["error"] - made.choice.estimate.error
         assert made.choice.estimate.bound + left_out <= error

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from rooms import HALF, HEIGHT, STEP, corner_cameras, merged, room, sheet, splat
+from splats import one_gaussian
 
 from gsencoder.geometry import rotmats_from_quats
 from gsencoder.infer.views.candidates import FreeSpace, patches
@@ -82,34 +83,29 @@ def test_few_gaussians_and_many_in_one_place_have_a_free_space(count: int) -> No
     assert free.first_hit(np.array([[-1.0, 0, 0]]), np.array([[1.0, 0, 0]]), np.array([3.0]))[0] < 1.01
 
 
+RAY = np.full((1, 3), 0.01), np.array([[1.0, 0, 0]]), np.array([3.0])
+
+
 def test_faint_gaussians_are_no_obstacle_unless_there_are_no_others() -> None:
     wall = splat(sheet((1.0, 0, 0), (1, 2), (1.0, 1.0)))
     means = wall.means - np.array([0.5, 0, 0], np.float32)
     faint = replace(wall, means=means, opacities=np.full(len(wall), 0.1, np.float32))
     both = merged(wall, faint)
-    ray = (np.zeros((1, 3)) + 0.01, np.array([[1.0, 0, 0]]), np.array([3.0]))
-    assert FreeSpace(both).first_hit(*ray)[0] > 0.8
-    assert FreeSpace(faint).first_hit(*ray)[0] < 0.6
+    assert FreeSpace(both).first_hit(*RAY)[0] > 0.8
+    assert FreeSpace(faint).first_hit(*RAY)[0] < 0.6
 
 
 def test_floaters_far_away_change_nothing_in_the_room() -> None:
     wall = sheet((1.0, 0, 0), (1, 2), (1.0, 1.0))
-    far = FreeSpace(splat(np.concatenate([wall, [[1e9, -1e9, 1e9]]])))
-    near = FreeSpace(splat(wall))
-    ray = (np.zeros((1, 3)) + 0.01, np.array([[1.0, 0, 0]]), np.array([3.0]))
-    assert far.first_hit(*ray) == pytest.approx(near.first_hit(*ray), abs=2 * near.cell)
+    far, near = (FreeSpace(splat(points)) for points in (np.concatenate([wall, [[1e9, -1e9, 1e9]]]), wall))
+    assert far.first_hit(*RAY) == pytest.approx(near.first_hit(*RAY), abs=2 * near.cell)
 
 
-def one(
-    scales: tuple[float, float, float], quat: np.ndarray, mean: tuple[float, float, float] = (0, 0, 0)
-) -> Gaussians:
-    return Gaussians(
-        means=np.array([mean], np.float32),
-        quats=(quat / np.linalg.norm(quat)).astype(np.float32)[None],
-        scales=np.array([scales], np.float32),
-        opacities=np.ones(1, np.float32),
-        sh=np.zeros((1, 1, 3), np.float32),
-    )
+Three = tuple[float, float, float]
+
+
+def one(scales: Three, quat: np.ndarray, mean: Three = (0, 0, 0)) -> Gaussians:
+    return replace(one_gaussian(mean, scales, 1.0), quats=(quat / np.linalg.norm(quat)).astype(np.float32)[None])
 
 
 def test_small_gaussians_stay_as_they_are(rng: np.random.Generator) -> None:

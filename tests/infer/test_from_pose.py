@@ -4,18 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from posed_words import (
-    CHANNELS,
-    NAMES,
-    SPACE,
-    memory_of,
-    opaque_ball,
-    plain_relevancy,
-    scene_of,
-    some_features,
-    two_kinds,
-    words,
-)
+from feature_fields import plain_features
+from posed_words import CHANNELS, NAMES, SPACE, ball_scene, memory_of, plain_relevancy, scene_of, two_kinds, words
 from scipy.spatial.transform import Rotation
 from splats import front_camera, one_gaussian, random_rotation
 
@@ -23,15 +13,14 @@ from gsencoder.core.errors import InputError
 from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, PosePoint, from_pose
 from gsencoder.infer.relevancy import ThresholdConfig, relevancy
 from gsencoder.text.table import make_text_table
-from gsencoder.types import Cameras, GaussianFeatures, Gaussians
+from gsencoder.types import Cameras, Gaussians
 
 EVERYTHING = FromPoseConfig(threshold=ThresholdConfig(kind="fixed", fixed=-1.0))
 
 
 @pytest.mark.parametrize("kind", ["vectors", "basis", "table"])
 def test_the_pixel_is_where_an_exhaustive_search_over_the_plain_definition_finds_it(kind: str) -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    scene = scene_of(gaussians, some_features(len(gaussians), kind))
+    scene, cameras, text = ball_scene(kind), front_camera(), words()
     plain = plain_relevancy(scene, cameras, text, NAMES)
     assert (plain > -2).any()
     for point, scores in zip(from_pose(scene, cameras, NAMES, text), plain, strict=True):
@@ -44,8 +33,7 @@ def test_the_pixel_is_where_an_exhaustive_search_over_the_plain_definition_finds
 
 
 def test_maps_of_relevancy_are_the_plain_definition_and_nan_where_there_is_no_surface() -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    scene = scene_of(gaussians, some_features(len(gaussians), "basis"))
+    scene, cameras, text = ball_scene(), front_camera(), words()
     maps = FeatureField(scene).at(cameras).relevancy(NAMES[:3], text)
     plain = plain_relevancy(scene, cameras, text, NAMES[:3]).reshape(maps.shape)
     assert np.array_equal(np.isnan(maps), plain == -2)
@@ -54,9 +42,8 @@ def test_maps_of_relevancy_are_the_plain_definition_and_nan_where_there_is_no_su
 
 
 def test_depth_and_position_agree_with_the_camera_and_with_the_gaussians_of_the_pixel() -> None:
-    gaussians, text = opaque_ball(), words()
-    origin = (10.0, -20.0, 5.0)
-    scene = scene_of(gaussians, some_features(len(gaussians), "basis"), origin)
+    text, origin = words(), (10.0, -20.0, 5.0)
+    scene = ball_scene(origin=origin)
     seen = FeatureField(scene).at(front_camera())
     own = relevancy(scene.features["toy"], text.encode(NAMES), text.mean)
     both = [0, 0]
@@ -74,10 +61,8 @@ def test_depth_and_position_agree_with_the_camera_and_with_the_gaussians_of_the_
         chosen = relevant if relevant.any() else np.isfinite(scores[columns])
         depths = seen.b.depths.numpy()[columns]
         assert point.depth in depths[chosen]
-        before, until = (
-            weights[chosen & mask].sum() / weights[chosen].sum()
-            for mask in (depths < point.depth, depths <= point.depth)
-        )
+        masks = depths < point.depth, depths <= point.depth
+        before, until = (weights[chosen & mask].sum() / weights[chosen].sum() for mask in masks)
         assert before <= 0.5 + 1e-6
         assert until >= 0.5 - 1e-6
     assert both[1] > 0
@@ -89,23 +74,17 @@ def moved_world(gaussians: Gaussians, cameras: Cameras, R: np.ndarray, t: np.nda
     inverse = np.eye(4)
     inverse[:3, :3], inverse[:3, 3] = R.T, -R.T @ t
     poses = cameras.cam_from_world.astype(np.float64) @ inverse
-    return (
-        replace(
-            gaussians,
-            means=(gaussians.means @ R.T + t).astype(np.float32),
-            quats=turned.as_quat()[:, [3, 0, 1, 2]].astype(np.float32),
-        ),
-        replace(cameras, cam_from_world=poses.astype(np.float32)),
-    )
+    quats = turned.as_quat()[:, [3, 0, 1, 2]].astype(np.float32)
+    moved = replace(gaussians, means=(gaussians.means @ R.T + t).astype(np.float32), quats=quats)
+    return moved, replace(cameras, cam_from_world=poses.astype(np.float32))
 
 
 def test_a_world_that_is_rotated_and_moved_moves_the_positions(rng: np.random.Generator) -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    features = some_features(len(gaussians), "basis")
+    scene, cameras, text = ball_scene(), front_camera(), words()
     R, t = random_rotation(rng), rng.normal(size=3)
-    before = from_pose(scene_of(gaussians, features), cameras, NAMES, text)
-    others, looking = moved_world(gaussians, cameras, R, t)
-    after = from_pose(scene_of(others, features), looking, NAMES, text)
+    before = from_pose(scene, cameras, NAMES, text)
+    others, looking = moved_world(scene.gaussians, cameras, R, t)
+    after = from_pose(replace(scene, gaussians=others), looking, NAMES, text)
     same = [np.array_equal(a.pixel, b.pixel) for a, b in zip(before, after, strict=True)]
     assert np.mean(same) >= 0.9  # Rounding may prefer another of two even pixels.
     for a, b, alike in zip(before, after, same, strict=True):
@@ -115,10 +94,8 @@ def test_a_world_that_is_rotated_and_moved_moves_the_positions(rng: np.random.Ge
 
 
 def test_an_origin_a_thousand_kilometres_away_loses_nothing() -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    features, origin = some_features(len(gaussians), "basis"), (1e6, -2e6, 3e6)
-    near = from_pose(scene_of(gaussians, features), cameras, NAMES, text)
-    far = from_pose(scene_of(gaussians, features, origin), cameras, NAMES, text)
+    cameras, text, origin = front_camera(), words(), (1e6, -2e6, 3e6)
+    near, far = (from_pose(scene, cameras, NAMES, text) for scene in (ball_scene(), ball_scene(origin=origin)))
     for a, b in zip(near, far, strict=True):
         assert np.array_equal(a.pixel, b.pixel)
         np.testing.assert_allclose(b.position - origin, a.position, atol=1e-9)
@@ -133,12 +110,8 @@ def assert_nothing(point: PosePoint) -> None:
 @pytest.mark.parametrize("case", ["behind", "faint", "never seen", "no Gaussians", "empty table"])
 def test_where_no_surface_with_features_is_in_view_nothing_is_visible(case: str) -> None:
     gaussians = one_gaussian((0, 0, -2 if case == "behind" else 2), opacity=0.4 if case == "faint" else 0.9)
-    features = GaussianFeatures(
-        features=np.zeros((1, CHANNELS), np.float32),
-        weights=np.full(1, case != "never seen", np.float32),
-        mean=np.ones(CHANNELS, np.float32),
-        space=SPACE,
-    )
+    mean, seen = np.ones(CHANNELS, np.float32), np.full(1, case != "never seen")
+    features = plain_features(np.zeros((1, CHANNELS)), SPACE, seen, mean)
     if case == "no Gaussians":
         gaussians = gaussians.select(np.zeros(0, int))
         features = replace(features, features=features.features[:0], weights=features.weights[:0])
@@ -185,8 +158,7 @@ def test_the_depth_is_that_of_what_is_relevant_and_not_between_it_and_the_backgr
 
 
 def test_words_together_are_as_one_by_one() -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    field = FeatureField(scene_of(gaussians, some_features(len(gaussians), "basis")))
+    cameras, text, field = front_camera(), words(), FeatureField(ball_scene())
     frame = field.at(cameras)
     assert len(NAMES) > 16
     for together, name in zip(frame.find(NAMES, text), NAMES, strict=True):
@@ -201,17 +173,12 @@ def test_cameras_are_answered_in_order_each_with_all_words() -> None:
     poses = np.stack([np.eye(4), np.diag([-1.0, 1, -1, 1])]).astype(np.float32)
     cameras = replace(front_camera().select([0, 0]), cam_from_world=poses)
     points = from_pose(scene_of(gaussians, features), cameras, NAMES[:2], words())
-    assert [(point.camera, point.query, point.visible) for point in points] == [
-        (0, NAMES[0], True),
-        (0, NAMES[1], False),
-        (1, NAMES[0], False),
-        (1, NAMES[1], True),
-    ]
+    assert [(point.camera, point.query) for point in points] == [(view, word) for view in (0, 1) for word in NAMES[:2]]
+    assert [point.visible for point in points] == [True, False, False, True]
 
 
 def test_wrong_input_is_refused() -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    scene = scene_of(gaussians, some_features(len(gaussians), "basis"))
+    scene, cameras, text = ball_scene(), front_camera(), words()
     field = FeatureField(scene)
     with pytest.raises(InputError, match="one or more words"):
         field.at(cameras).find([], text)

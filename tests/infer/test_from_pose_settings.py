@@ -10,6 +10,7 @@ from posed_words import (
     CHANNELS,
     NAMES,
     SPACE,
+    ball_scene,
     memory_of,
     opaque_ball,
     plain_relevancy,
@@ -31,7 +32,7 @@ MODES: list[Mode] = ["centered", "raw"]
 
 
 def small_scene(kind: str = "vectors") -> Scene:
-    return scene_of(opaque_ball(300), some_features(300, kind))
+    return ball_scene(kind, n=300)
 
 
 def cosines(rows: np.ndarray, mean: np.ndarray, mode: Mode) -> np.ndarray:
@@ -107,9 +108,8 @@ def test_attended_features_much_shorter_than_the_mean_have_no_direction() -> Non
     for length, least, most in ((1e-6, 0.0, 1e-3), (1.0, 0.2, 1.0)):
         components = mean + np.float32(length) * words().encode(WORDS)[[0] * 9] * np.float32(100)
         bank = replace(memory.bank, components=components.astype(np.float32), mean=mean)
-        field = FeatureField(
-            replace(scene, features={}), memory=replace(memory, bank=bank, mean=mean), config=FromPoseConfig(stride=4)
-        )
+        changed, bare = replace(memory, bank=bank, mean=mean), replace(scene, features={})
+        field = FeatureField(bare, memory=changed, config=FromPoseConfig(stride=4))
         largest = np.nanmax(np.abs(field.at(front_camera()).relevancy(WORDS, text)))
         assert least <= largest <= most
 
@@ -149,8 +149,7 @@ def test_rays_at_a_stride_are_those_of_their_pixels(width: int, height: int, str
 
 
 def test_at_a_stride_the_best_of_these_pixels_is_found() -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    scene = scene_of(gaussians, some_features(len(gaussians), "basis"))
+    scene, cameras, text = ball_scene(), front_camera(), words()
     plain = plain_relevancy(scene, cameras, text, NAMES).reshape(len(NAMES), 43, 61)[:, 2::4, 2::4]
     for point, scores in zip(from_pose(scene, cameras, NAMES, text, FromPoseConfig(stride=4)), plain, strict=True):
         column, row = (point.pixel - 2.5).astype(int) // 4
@@ -192,17 +191,12 @@ def test_a_memory_answers_as_features_where_its_attention_is_exact() -> None:
         scoring="centered", temperature=0.01, mean=features.mean,
     )  # fmt: skip
     scene, config = scene_of(gaussians, features), FromPoseConfig(stride=1)
-    plain, remembered = (
-        FeatureField(scene, memory=each, config=config).at(front_camera()).relevancy(NAMES[:2], words())
-        for each in (None, memory)
-    )
+    fields = (FeatureField(scene, memory=each, config=config).at(front_camera()) for each in (None, memory))
+    plain, remembered = (field.relevancy(NAMES[:2], words()) for field in fields)
     assert np.isfinite(plain).any()
     np.testing.assert_allclose(remembered, plain, atol=1e-5)
-    for a, b in zip(
-        from_pose(scene, front_camera(), NAMES[:2], words(), config),
-        from_pose(scene, front_camera(), NAMES[:2], words(), config, memory=memory),
-        strict=True,
-    ):
+    points = (from_pose(scene, front_camera(), NAMES[:2], words(), config, memory=each) for each in (None, memory))
+    for a, b in zip(*points, strict=True):
         assert a.visible
         assert b.visible
         assert a.threshold == pytest.approx(b.threshold, abs=1e-5)

@@ -15,7 +15,7 @@ from gsencoder.infer import localize as module
 from gsencoder.infer.draw import EDGES, box_corners, write_boxes_ply
 from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
 from gsencoder.infer.relevancy import ThresholdConfig
-from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.table import make_text_table, unit
 from gsencoder.types import Box, FeatureBasis, GaussianFeatures, Localization, Scene
 
 WORDS = ("mug", "chair", "lamp", "spoon", "rug", "door")
@@ -29,13 +29,8 @@ def lattice(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def make_table() -> TextTable:
-    rng = np.random.default_rng(5)
-    vectors = rng.normal(size=(len(WORDS), 32)) * 0.5 + rng.normal(size=32) * 1.5
-    return make_text_table(WORDS, vectors / np.linalg.norm(vectors, axis=1, keepdims=True), "toy")
-
-
-TABLE = make_table()
+RNG = np.random.default_rng(5)
+TABLE = make_text_table(WORDS, unit(RNG.normal(size=(len(WORDS), 32)) * 0.5 + RNG.normal(size=32) * 1.5), "toy")
 
 
 def make_room_scene(*, basis: bool = False, origin: tuple[float, float, float] = (0, 0, 0)) -> Scene:
@@ -57,10 +52,8 @@ def make_room_scene(*, basis: bool = False, origin: tuple[float, float, float] =
         stored_basis = FeatureBasis(mean=TABLE.mean, components=rows.astype(np.float32), energy_kept=1.0, space=space)
         features = ((features - TABLE.mean) @ rows.T).astype(np.float32) * (weights > 0)[:, None]
     fused = GaussianFeatures(features=features, weights=weights, mean=TABLE.mean, space=space, basis=stored_basis)
-    up = np.array([0.0, 0, 1])
-    return Scene(
-        name="room", gaussians=splat(means, 0.01), features={"toy": fused}, origin=np.array(origin, float), up=up
-    )
+    places = {"origin": np.array(origin, float), "up": np.array([0.0, 0, 1])}
+    return Scene(name="room", gaussians=splat(means, 0.01), features={"toy": fused}, **places)
 
 
 SCENE = make_room_scene()
@@ -108,9 +101,7 @@ def test_the_order_of_the_gaussians_does_not_matter(rng: np.random.Generator) ->
 
 def test_the_origin_is_added_back_in_double_precision() -> None:
     far = (1e6, -2e6, 3e6)
-    near_box, far_box = (
-        localize(make_room_scene(origin=origin), ["mug"], TABLE).boxes[0] for origin in ((0, 0, 0), far)
-    )
+    near_box, far_box = (localize(each, ["mug"], TABLE).boxes[0] for each in (SCENE, make_room_scene(origin=far)))
     np.testing.assert_allclose(far_box.aabb_min - far, near_box.aabb_min, atol=1e-8)
     np.testing.assert_allclose(far_box.obb_center - far, near_box.obb_center, atol=1e-8)
     assert far_box.aabb_min.dtype == np.float64

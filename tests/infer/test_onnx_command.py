@@ -22,18 +22,13 @@ from gsencoder.teachers.base import Head
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def folder(exported: Path) -> Path:
-    return exported
-
-
-def test_the_command_tells_what_it_compared(folder: Path) -> None:
-    results = json.loads((folder / "encoder.onnx.summary.json").read_text())["results"]
-    assert results["onnx"] == str(folder / "encoder.onnx")
+def test_the_command_tells_what_it_compared(exported: Path) -> None:
+    results = json.loads((exported / "encoder.onnx.summary.json").read_text())["results"]
+    assert results["onnx"] == str(exported / "encoder.onnx")
     assert set(results["parity"]) == {"1 random Gaussians", "50 random Gaussians"}
     assert 0 <= max(results["parity"].values()) < TOLERANCE
     assert (results["rank"], results["channels"], results["words"]) == (4, 6, 3)
-    assert results["bytes"] == (folder / "encoder.onnx").stat().st_size
+    assert results["bytes"] == (exported / "encoder.onnx").stat().st_size
 
 
 @pytest.mark.parametrize(
@@ -55,7 +50,7 @@ def test_the_command_refuses_before_it_begins(words, message, tmp_path, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["taken.onnx"]
 
 
-def test_words_are_found_in_an_interpreter_that_has_no_torch_and_by_the_example(folder: Path, tmp_path: Path) -> None:
+def test_words_are_found_in_an_interpreter_that_has_no_torch_and_by_the_example(exported: Path, tmp_path: Path) -> None:
     cloud = random_cloud(2000, 0.05)
     # Half of the sheet is white and the other black, so that even an untrained encoder tells them apart.
     left = cloud.means[:, :1] < 0
@@ -70,10 +65,10 @@ def test_words_are_found_in_an_interpreter_that_has_no_torch_and_by_the_example(
         "            raise ModuleNotFoundError('no torch here', name=name)\n"
         "sys.meta_path.insert(0, NoTorch())\n"
         "from gsencoder.app.main import main\n"
-        f"splat, weights, out = {str(tmp_path / 'room.ply')!r}, {str(folder / 'encoder.onnx')!r}, {str(tmp_path)!r}\n"
+        f"splat, weights, out = {str(tmp_path / 'room.ply')!r}, {str(exported / 'encoder.onnx')!r}, {str(tmp_path)!r}\n"
         "assert main(['encode', splat, f'weights={weights}', f'out={out}/features']) == 0\n"
         "from gsencoder import load_splat, localize\n"
-        "from gsencoder.fusion.folder import load_features\n"
+        "from gsencoder.fusion.exported import load_features\n"
         "from gsencoder.infer.encode import Encoder\n"
         "scene = load_features(__import__('pathlib').Path(out) / 'features')\n"
         "assert len(localize(scene, ['mugs'], Encoder.load(weights).words).boxes) > 0\n"

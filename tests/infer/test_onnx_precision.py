@@ -102,10 +102,8 @@ def test_a_convolution_of_integers_is_that_of_what_they_stand_for(rows: int) -> 
     x = rng.integers(0, 256, (len(cells), 5)).astype(np.uint8)
     weight = rng.integers(-PRODUCT_LIMIT, PRODUCT_LIMIT + 1, (27 * 5, 7)).astype(np.int8)
     step, zero, scale = np.float32(0.02), np.uint8(113), rng.uniform(0.001, 0.1, 7).astype(np.float32)
-    output = operator(
-        "convolve_int8",
-        {"x": x, "step": np.array(step), "zero": np.array(zero), "n": neighbors, "weight": weight, "scale": scale},
-    )
+    values = {"x": x, "step": np.array(step), "zero": np.array(zero)}
+    output = operator("convolve_int8", values | {"n": neighbors, "weight": weight, "scale": scale})
     stands = torch.from_numpy(step.astype(np.float64) * (x.astype(np.float64) - zero))
     matrix = torch.from_numpy((weight * scale.astype(np.float64)).reshape(27, 5, 7))
     expected = convolve_reference(stands, torch.from_numpy(neighbors), matrix).numpy()
@@ -119,14 +117,8 @@ def test_a_linear_layer_of_integers_is_that_of_what_they_stand_for() -> None:
     x = rng.integers(0, 256, (40, 64)).astype(np.uint8)
     weight = rng.integers(-PRODUCT_LIMIT, PRODUCT_LIMIT + 1, (64, 9)).astype(np.int8)
     scale, bias = rng.uniform(0.001, 0.1, 9).astype(np.float32), rng.normal(size=9).astype(np.float32)
-    values = {
-        "x": x,
-        "step": np.array(0.5, np.float32),
-        "zero": np.array(7, np.uint8),
-        "w": weight,
-        "s": scale,
-        "b": bias,
-    }
+    values = {"x": x, "step": np.array(0.5, np.float32), "zero": np.array(7, np.uint8)}
+    values |= {"w": weight, "s": scale, "b": bias}
     expected = 0.5 * (x.astype(float) - 7) @ (weight * scale.astype(float)) + bias
     np.testing.assert_allclose(operator("linear_int8", values), expected, rtol=1e-5, atol=1e-3)
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from feature_fields import plain_features
 from symbolic import symbolic_sizes
 
 from gsencoder.core.errors import InputError
@@ -87,15 +88,8 @@ class FeaturesOf:
 
     def encode_spaces(self, gaussians: Gaussians, *_: object, **__: object) -> dict[str, GaussianFeatures]:
         rows = np.random.default_rng(0).normal(size=(2, len(gaussians), 3)).astype(np.float32)
-        return {
-            name: GaussianFeatures(
-                features=rows[int(name == self.wrong)],
-                weights=np.ones(len(gaussians), np.float32),
-                mean=np.zeros(3, np.float32),
-                space=FeatureSpace(name=name, channels=3),
-            )
-            for name in ("first", "second")
-        }
+        spaces = {name: FeatureSpace(name=name, channels=3) for name in ("first", "second")}
+        return {name: plain_features(rows[int(name == self.wrong)], space) for name, space in spaces.items()}
 
 
 @pytest.mark.parametrize("wrong", ["first", "second"])

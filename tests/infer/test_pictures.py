@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from feature_fields import box_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rooms import UP, merged, splat
@@ -28,22 +29,12 @@ from gsencoder.types import Box, Gaussians
 
 K = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], np.float32)
 POSE = np.eye(4, dtype=np.float32)
+GREY = np.full((480, 640, 3), 90, np.uint8)
 
 
 def make_box(center: tuple[float, ...], size: tuple[float, ...] = (1, 1, 1), query: str = "mug", rank: int = 0) -> Box:
-    middle, sides = np.array(center, float), np.array(size, float)
-    return Box(
-        query=query,
-        rank=rank,
-        score=0.75,
-        probability=1.0,
-        aabb_min=middle - sides / 2,
-        aabb_max=middle + sides / 2,
-        obb_center=middle,
-        obb_rotation=np.eye(3),
-        obb_size=sides,
-        rows=np.arange(3),
-    )
+    middle, half = np.array(center, float), np.array(size, float) / 2
+    return box_of(query, rank, np.arange(3), middle - half, middle + half, score=0.75)
 
 
 def test_relevancy_goes_from_blue_to_red_and_leaves_unseen_pixels_grey() -> None:
@@ -57,9 +48,8 @@ def test_relevancy_goes_from_blue_to_red_and_leaves_unseen_pixels_grey() -> None
 
 
 def test_corners_of_a_box_land_where_the_pinhole_puts_them() -> None:
-    grey = np.full((480, 640, 3), 90, np.uint8)
     box = make_box((0.2, 0.1, 4.0))
-    drawn = draw_boxes(grey, [box], POSE, K)
+    drawn = draw_boxes(GREY, [box], POSE, K)
     changed = (drawn != 90).any(axis=2)
     corners = box_corners(box)
     for pixel in (corners @ K.T.astype(float))[:, :2] / corners[:, 2:]:
@@ -69,41 +59,35 @@ def test_corners_of_a_box_land_where_the_pinhole_puts_them() -> None:
 
 
 def test_a_small_picture_shows_the_box_at_the_same_place() -> None:
-    large = draw_boxes(np.full((480, 640, 3), 90, np.uint8), [make_box((0, 0, 4.0))], POSE, K)
+    large = draw_boxes(GREY, [make_box((0, 0, 4.0))], POSE, K)
     half = K.copy()
     half[:2] /= 2
-    small = draw_boxes(np.full((240, 320, 3), 90, np.uint8), [make_box((0, 0, 4.0))], POSE, half)
+    small = draw_boxes(GREY[::2, ::2], [make_box((0, 0, 4.0))], POSE, half)
     assert np.array_equal(large, small)
 
 
 def test_the_origin_is_taken_off_before_projecting() -> None:
-    grey = np.full((480, 640, 3), 90, np.uint8)
     origin = np.array([1e6, -1e6, 5.0])
     far = make_box(tuple(np.array([0, 0, 4.0]) + origin))
-    expected = draw_boxes(grey, [make_box((0, 0, 4.0))], POSE, K)
-    assert np.abs(draw_boxes(grey, [far], POSE, K, origin=origin).astype(int) - expected).max() == 0
+    expected = draw_boxes(GREY, [make_box((0, 0, 4.0))], POSE, K)
+    assert np.abs(draw_boxes(GREY, [far], POSE, K, origin=origin).astype(int) - expected).max() == 0
 
 
 def test_a_box_behind_the_camera_draws_nothing() -> None:
-    grey = np.full((480, 640, 3), 90, np.uint8)
-    assert np.array_equal(draw_boxes(grey, [make_box((0, 0, -3.0))], POSE, K), grey)
-    assert np.array_equal(draw_boxes(grey, [make_box((500.0, 0, 3.0))], POSE, K), grey)
+    assert np.array_equal(draw_boxes(GREY, [make_box((0, 0, -3.0))], POSE, K), GREY)
+    assert np.array_equal(draw_boxes(GREY, [make_box((500.0, 0, 3.0))], POSE, K), GREY)
 
 
 def test_a_box_around_the_camera_is_cut_at_the_near_plane() -> None:
-    grey = np.full((480, 640, 3), 90, np.uint8)
-    drawn = draw_boxes(grey, [make_box((0, 0, 0), (1, 1, 8))], POSE, K)
+    drawn = draw_boxes(GREY, [make_box((0, 0, 0), (1, 1, 8))], POSE, K)
     assert (drawn != 90).any()
 
 
-@given(
-    st.tuples(*[st.floats(-1e6, 1e6)] * 3),
-    st.tuples(*[st.floats(0, 1e6)] * 3),
-    st.text(max_size=60),
-    st.integers(1, 80),
-    st.integers(1, 80),
-)
-@settings(deadline=None, max_examples=25)
+SIDE = st.integers(1, 80)
+
+
+@given(st.tuples(*[st.floats(-1e6, 1e6)] * 3), st.tuples(*[st.floats(0, 1e6)] * 3), st.text(max_size=60), SIDE, SIDE)
+@settings(max_examples=25)
 def test_any_box_and_any_word_can_be_drawn_on_any_picture(center, size, query, width, height):
     drawn = draw_boxes(np.zeros((height, width, 3), np.uint8), [make_box(center, size, query)], POSE, K)
     factor = legible_factor(width)
@@ -111,9 +95,8 @@ def test_any_box_and_any_word_can_be_drawn_on_any_picture(center, size, query, w
 
 
 def test_labels_of_boxes_in_one_place_do_not_cover_each_other() -> None:
-    grey = np.full((480, 640, 3), 90, np.uint8)
     boxes = [make_box((0, 0, 6.0), query=word) for word in ("one", "two", "three", "four")]
-    drawn = draw_boxes(grey, boxes, POSE, K)
+    drawn = draw_boxes(GREY, boxes, POSE, K)
     labels = [np.array(color) for color in ((31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40))]
     heights = [(np.abs(drawn.astype(int) - color).max(axis=2) == 0).sum() for color in labels]
     assert min(heights) > 60 * 12

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from feature_fields import plain_features
 from splats import front_camera, one_gaussian, random_gaussians
 
 from gsencoder.infer.draw import legible_factor
@@ -18,7 +19,7 @@ from gsencoder.infer.from_pose import (
     view_picture,
 )
 from gsencoder.render.images import render_image
-from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
+from gsencoder.types import FeatureSpace, Gaussians, Scene
 
 
 @pytest.fixture(autouse=True)
@@ -31,12 +32,7 @@ def labels(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def seen_from(width: int, height: int, stride: int = 1, gaussians: Gaussians | None = None) -> SeenField:
     gaussians = one_gaussian() if gaussians is None else gaussians
-    features = GaussianFeatures(
-        features=np.ones((len(gaussians), 3), np.float32),
-        weights=np.ones(len(gaussians), np.float32),
-        mean=np.zeros(3, np.float32),
-        space=FeatureSpace(name="toy", channels=3, text_encoder="toy"),
-    )
+    features = plain_features(np.ones((len(gaussians), 3)), FeatureSpace(name="toy", channels=3, text_encoder="toy"))
     scene = Scene(name="toy", gaussians=gaussians, features={"toy": features})
     return FeatureField(scene, config=FromPoseConfig(stride=stride)).at(front_camera(width, height))
 

@@ -33,7 +33,7 @@ from gsencoder.infer.relevancy import (
     probability,
     relevancy,
 )
-from gsencoder.text.table import TextEncoder, TextTable, make_text_table
+from gsencoder.text.table import TextEncoder, TextTable, make_text_table, unit
 from gsencoder.types import FeatureBasis, GaussianFeatures, Localization, Scene
 
 WORDS = ("mug", "cup", "chair", "lamp", "spoon")
@@ -70,13 +70,8 @@ def make_scene(strength: float = 1.0, *, basis: bool = False) -> Scene:
     places = np.array([[0.2, 0.2, 0.3], [0.7, 0.5, 0.3]])
     means = np.concatenate([floor, cube + places[0], cube + places[1]]).astype(np.float32)
     mug, chair, spoon = (TABLE.embeddings[WORDS.index(word)] - TABLE.mean for word in ("mug", "chair", "spoon"))
-    away = np.concatenate(
-        [
-            np.tile(0.4 * np.eye(16)[10], (len(floor), 1)),
-            np.tile(strength * mug, (125, 1)),
-            np.tile(chair + spoon / 2, (125, 1)),
-        ]
-    )
+    kinds = (0.4 * np.eye(16)[10], strength * mug, chair + spoon / 2)
+    away = np.repeat(kinds, (len(floor), 125, 125), axis=0)
     features = (TABLE.mean + away + rng.normal(0, 0.02, away.shape)).astype(np.float32)
     weights = rng.uniform(0.5, 2, len(means)).astype(np.float32)
     space, stored_basis = replace(TABLE.space, teacher="labels"), None
@@ -107,15 +102,9 @@ def plain_evidence(
     features: GaussianFeatures, word: str, rows: np.ndarray, names: Sequence[str]
 ) -> tuple[float, float]:
     """Mean and margin by decoding every feature."""
-
-    def unit(vectors: np.ndarray) -> np.ndarray:
-        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
     fits = unit(features.decode(rows).astype(float) - features.mean) @ unit(TABLE.encode(names) - TABLE.mean).T
-    mean = np.average(fits, axis=0, weights=features.weights[rows])
-    return mean[names.index(word)], mean[names.index(word)] - max(
-        value for name, value in zip(names, mean, strict=True) if name != word
-    )
+    mean = dict(zip(names, np.average(fits, axis=0, weights=features.weights[rows]), strict=True))
+    return mean[word], mean[word] - max(value for name, value in mean.items() if name != word)
 
 
 @pytest.mark.parametrize("basis", [False, True])
@@ -167,10 +156,8 @@ def test_rivals_of_another_space_are_refused() -> None:
 def test_evidence_is_of_cosines_however_relevancy_is_scored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "NEGATIVES", ("lamp", "chair"))
     fixed = ThresholdConfig(kind="fixed", fixed=0.7)
-    plain, contrast = (
-        candidates_of(["mug"], TABLE, LocalizeConfig(contrast=contrast, threshold=fixed))[0]
-        for contrast in (False, True)
-    )
+    configs = (LocalizeConfig(contrast=contrast, threshold=fixed) for contrast in (False, True))
+    plain, contrast = (candidates_of(["mug"], TABLE, config)[0] for config in configs)
     np.testing.assert_array_equal(plain.clusters[0].rows, contrast.clusters[0].rows)
     assert replace(plain.evidence[0], share=0.0) == replace(contrast.evidence[0], share=0.0)
 

@@ -20,17 +20,15 @@ SCANQA = [
 SQA3D = {
     "questions": [{"scene_id": "a", "situation": "I sit.", "question": "What is left?", "question_id": 220602000002}]
 }
+
+
+def described(number: int | str, scene: str = "a", name: str = "x", **changes: Any) -> dict[str, Any]:
+    keys = {"scene_id": scene, "object_id": number, "object_name": name, "ann_id": "0", "description": f"d {number}"}
+    return keys | {"token": ["d"]} | changes
+
+
 SCANREFER = [
-    {
-        "scene_id": "a",
-        "object_id": "8",
-        "object_name": "file_cabinet",
-        "ann_id": number,
-        "description": f"the cabinet {number}",
-        "token": ["the"],
-        "bbox": box_corners(LOW, HIGH),
-    }
-    for number in ("0", "1")
+    described("8", ann_id=number, description=f"the cabinet {number}", bbox=box_corners(LOW, HIGH)) for number in "01"
 ]
 SCAN2CAP = {"a": [{"box": box_corners(LOW, HIGH), "caption": "old", "obj_prob": [0.25, 0.75], "sem_prob": [1.0]}]}
 
@@ -80,10 +78,8 @@ def test_descriptions_of_scanrefer_are_grounded(tmp_path: Path) -> None:
     targets = [other, {"aabb_min": LOW, "aabb_max": HIGH}]
     keys = {"scene_id": "a", "object_id": "8", "ann_id": "1"}
     meant, missed = box_corners(LOW, HIGH), box_corners((5.0, 5.0, 5.0), (6.0, 6.0, 6.0))
-    assert answers(question_set, answer="2", mark=2, targets=targets)[1] == keys | {
-        "bbox": meant,
-        "bboxes": [meant, missed],
-    }
+    found = keys | {"bbox": meant, "bboxes": [meant, missed]}
+    assert answers(question_set, answer="2", mark=2, targets=targets)[1] == found
     nothing = keys | {"bbox": None, "bboxes": []}
     assert answers(question_set, answer="0", mark=0, targets=targets)[1] == nothing
     assert answers(question_set, answer="?", mark=None, targets=targets)[1] == nothing
@@ -153,23 +149,12 @@ def corners(low: float) -> list[list[float]]:
     return box_corners((float(low), 0.0, -1.0), (low + 1.0, 2.0, 3.0))
 
 
-def described(number: int, scene: str = "a", name: str = "x", **changes: Any) -> dict[str, Any]:
-    keys = {"scene_id": scene, "object_id": number, "object_name": name, "ann_id": "0", "description": f"d {number}"}
-    return keys | {"token": ["d"]} | changes
-
-
 def test_captions_of_scenes_keep_their_boxes_and_the_even_probabilities_of_eighteen_classes() -> None:
     keyed = caption_question("b", "7", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {"obj_prob": [0.5, 0.5]})
     bare = caption_question("a", "0", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {})
     assert (keyed.scene, keyed.id, keyed.question.task) == ("b", "b/7", "caption")
-    rows = predictions(
-        "scan2cap",
-        [
-            (keyed, {"answer": "Two", "targets": [target(2)]}),
-            (bare, {"answer": "Five", "targets": [target(5)]}),
-            (bare, {"answer": "Six", "targets": [target(6), target(0)]}),
-        ],
-    )
+    answered = [(keyed, {"answer": "Two", "targets": [target(2)]}), (bare, {"answer": "Five", "targets": [target(5)]})]
+    rows = predictions("scan2cap", [*answered, (bare, {"answer": "Six", "targets": [target(6), target(0)]})])
     assert {scene: [(row["caption"], row["box"]) for row in found] for scene, found in rows.items()} == {
         "b": [("sos two eos", corners(2))],
         "a": [("sos five eos", corners(5)), ("sos six eos", corners(6))],
@@ -182,12 +167,8 @@ def test_captions_of_scenes_keep_their_boxes_and_the_even_probabilities_of_eight
 
 
 def test_each_object_is_captioned_once_in_its_own_box_and_only_in_scenes_that_are_asked_about(tmp_path: Path) -> None:
-    rows = [
-        described(4, bbox=corners(4)),
-        described(2, bbox=corners(2)),
-        described(4, ann_id="1", bbox=corners(4)),
-        described(4, "b", bbox=corners(9)),
-    ]
+    rows = [described(4, bbox=corners(4)), described(2, bbox=corners(2)), described(4, ann_id="1", bbox=corners(4))]
+    rows.append(described(4, "b", bbox=corners(9)))
     question_set = read(tmp_path, rows, task="caption")
     assert [(each.scene, each.id, each.question.aabb) for each in question_set.questions] == [
         ("a", "a/4", (4.0, 0.0, -1.0, 5.0, 2.0, 3.0)),
@@ -207,21 +188,9 @@ def test_names_that_are_localized_are_each_once_in_every_scene(tmp_path: Path) -
     assert (question_set.questions, question_set.scenes()) == ((), {"a": 2, "b": 1})
 
 
-@pytest.mark.parametrize(
-    ("text", "one"),
-    [
-        ('{"a": []}', True),
-        ('\ufeff\n {"questions": []}', True),
-        ("[", True),
-        ('{"query": "mug"}', False),
-        ('{"aabb": [0, 0, 0, 1, 1, 1]}', False),
-        ('{"a": 1}\n{"b": 2}', False),
-        (" " * 64 + "[]", False),
-        (" " * 63 + "[]", True),
-        ("{", False),
-        ("", False),
-    ],
-)
-def test_a_set_is_one_value_that_is_no_question(tmp_path: Path, text: str, one: bool) -> None:
-    (tmp_path / "s").write_text(text)
-    assert is_question_set(tmp_path / "s") is one
+def test_a_set_is_one_value_that_is_no_question(tmp_path: Path) -> None:
+    sets = ('{"a": []}', '\ufeff\n {"questions": []}', "[", " " * 63 + "[]")
+    others = ('{"query": "mug"}', '{"aabb": [0, 0, 0, 1, 1, 1]}', '{"a": 1}\n{"b": 2}', " " * 64 + "[]", "{", "")
+    for text in (*sets, *others):
+        (tmp_path / "s").write_text(text)
+        assert is_question_set(tmp_path / "s") is (text in sets), text

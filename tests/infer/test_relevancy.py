@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from feature_fields import plain_features
 
 from gsencoder.core.errors import InputError
 from gsencoder.infer.relevancy import ThresholdConfig, otsu, relevancy, threshold
@@ -22,11 +23,6 @@ def in_basis(rng: np.random.Generator, n: int = 500, rank: int = 5, scale: float
     weights[::7] = 0
     coordinates[::7] = 0
     return GaussianFeatures(features=coordinates, weights=weights, mean=mean, space=SPACE, basis=basis)
-
-
-def decoded(features: GaussianFeatures) -> GaussianFeatures:
-    vectors = features.decode().astype(np.float32)
-    return GaussianFeatures(features=vectors, weights=features.weights, mean=features.mean, space=SPACE)
 
 
 def words(rng: np.random.Generator, count: int = 3) -> np.ndarray:
@@ -78,14 +74,14 @@ def test_the_length_of_features_does_not_matter_at_either_end(rng: np.random.Gen
 def test_a_feature_equal_to_the_mean_answers_nothing_however_it_was_rounded(rng: np.random.Generator) -> None:
     mean = rng.normal(size=24).astype(np.float32)
     rows = np.stack([mean, mean * np.float32(1 + 1e-7), mean.astype(np.float16).astype(np.float32)])
-    features = GaussianFeatures(features=rows, weights=np.ones(3, np.float32), mean=mean, space=SPACE)
+    features = plain_features(rows, SPACE, mean=mean)
     text = words(rng, 20)
     assert np.abs(relevancy(features, text, np.zeros(24, np.float32))).max() < 0.2
 
 
 def test_a_zero_feature_and_a_zero_word_score_zero() -> None:
     zeros = np.zeros((2, 24), np.float32)
-    features = GaussianFeatures(features=zeros, weights=np.ones(2, np.float32), mean=zeros[0], space=SPACE)
+    features = plain_features(zeros, SPACE)
     text = np.zeros((1, 24), np.float32)
     assert np.array_equal(relevancy(features, text, np.zeros(24, np.float32), mode="raw"), np.zeros((1, 2), np.float32))
 
@@ -159,9 +155,7 @@ def test_the_cosine_of_a_feature_fades_as_its_distance_from_the_mean_falls_below
     mean[0], away[1] = 2.0, 1.0
     distances = 2.0 * np.array([1e-5, 1e-3, 1e-2, 1.0])
     rows = (mean + distances[:, None] * away).astype(np.float32)
-    features = GaussianFeatures(
-        features=rows, weights=np.ones(4, np.float32), mean=mean.astype(np.float32), space=SPACE
-    )
+    features = plain_features(rows, SPACE, mean=mean.astype(np.float32))
     text = np.float32([[0, 0.6, 0.8, *[0] * 21]])
     expected = 0.6 * distances / np.sqrt(distances**2 + 0.002**2)
     np.testing.assert_allclose(relevancy(features, text, np.zeros(24, np.float32))[0], expected, rtol=1e-4)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from feature_fields import answer_of
 from PIL import Image
 from rooms import UP, splat
 from splats import random_gaussians
@@ -16,7 +17,7 @@ from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.pictures import best_views, relevancy_pictures
 from gsencoder.render import blend
 from gsencoder.render.images import visible_shares
-from gsencoder.types import Cameras, Gaussians, Localization, Scene, Views
+from gsencoder.types import Cameras, Gaussians, Scene, Views
 
 
 def wall(x: float, half: float = 1.0, step: float = 0.1) -> np.ndarray:
@@ -100,13 +101,7 @@ def test_every_word_gets_its_pictures_with_names_that_any_disk_takes() -> None:
     scores = np.linspace(0, 1, len(gaussians), dtype=np.float32)
     scores[3] = np.nan
     words = ("a/b\\c", "é?", "x" * 500)
-    localization = Localization(
-        queries=words,
-        relevancy=np.tile(scores, (3, 1)),
-        thresholds=np.full(3, LocalizeConfig().threshold.fixed, np.float32),
-        probabilities=np.ones(3, np.float32),
-        boxes=(),
-    )
+    localization = answer_of(words, np.tile(scores, (3, 1)), threshold=LocalizeConfig().threshold.fixed)
     pictures = dict(relevancy_pictures(scene, localization, per_word=2))
     assert sorted(pictures) == [
         f"{index:02d}_{word}_view{view:03d}" for index, word in enumerate(("a_b_c", "é_", "x" * 60)) for view in (0, 1)
@@ -120,14 +115,7 @@ def test_the_photograph_is_on_the_left_and_relevancy_on_the_right() -> None:
     rng = np.random.default_rng(0)
     photograph = rng.integers(0, 256, (int(cameras.heights[0]), int(cameras.widths[0]), 3), dtype=np.uint8)
     views = Views(cameras=cameras, names=("a",), images=[photograph])
-    scores = np.ones((1, len(gaussians)), np.float32)
-    localization = Localization(
-        queries=("wall",),
-        relevancy=scores,
-        thresholds=np.full(1, 0.5, np.float32),
-        probabilities=np.ones(1, np.float32),
-        boxes=(),
-    )
+    localization = answer_of(("wall",), np.ones((1, len(gaussians)), np.float32), threshold=0.5)
     drawn = {}
     for name, images in (("photograph", [photograph]), ("rendered", None)):
         scene = Scene(name="wall", gaussians=gaussians, views=replace(views, images=images))

@@ -10,15 +10,7 @@ from selected_rooms import MUG, circling, permuted, selected_room, with_more, wo
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer import select as module
-from gsencoder.infer.select import (
-    SelectConfig,
-    Selection,
-    labels_of_parts,
-    sample_views,
-    select,
-    threshold_parts,
-    votes,
-)
+from gsencoder.infer.select import SelectConfig, Selection, sample_views, select, threshold_parts, votes
 from gsencoder.render import blend
 from gsencoder.types import Scene
 
@@ -98,7 +90,7 @@ def test_without_growing_the_gaussians_of_the_boxes_are_taken() -> None:
 def test_a_gaussian_that_several_words_take_goes_to_the_most_relevant_one_and_the_first_of_equal_ones() -> None:
     relevancy = np.array([[0.9, 0.4, 0.7, np.nan], [0.8, 0.6, 0.7, np.nan]], np.float32)
     parts = threshold_parts(("a", "b"), relevancy, 0.3)
-    assert labels_of_parts(parts, relevancy).tolist() == [1, 2, 1, 0]
+    assert module.labels_of_parts(parts, relevancy).tolist() == [1, 2, 1, 0]
 
 
 def test_a_splat_without_views_is_looked_at_from_placed_cameras(monkeypatch: pytest.MonkeyPatch) -> None:

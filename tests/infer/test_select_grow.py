@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from feature_fields import plain_features
 from selected_rooms import SPACE
 
 from gsencoder.infer.select import (
@@ -119,16 +120,6 @@ def plate(side: int = 24) -> np.ndarray:
     return grid + np.random.default_rng(4).normal(size=grid.shape) * 0.01
 
 
-def features_of(vectors: np.ndarray, seen: np.ndarray | None = None) -> GaussianFeatures:
-    weights = np.ones(len(vectors)) if seen is None else seen
-    return GaussianFeatures(
-        features=vectors.astype(np.float32),
-        weights=weights.astype(np.float32),
-        mean=np.zeros(8, np.float32),
-        space=SPACE,
-    )
-
-
 def by_features(
     places: np.ndarray, features: GaussianFeatures, parts: Parts, relevancy: np.ndarray, **settings: float
 ) -> tuple[Labels, Labels]:
@@ -146,11 +137,12 @@ def test_a_share_that_is_equal_to_the_limit_is_not_taken() -> None:
     # The rim is as near to the object as a spacing, so that it is no surroundings.
     places[rim, 0] = places[object_ & (places[:, 0] > 9.5), 0] + 0.9
     parts = ((np.flatnonzero(object_),),)
-    members, possible = by_features(places, features_of(vectors), parts, vectors[None, :, 0], share=0.5)
+    members, possible = by_features(places, plain_features(vectors, SPACE), parts, vectors[None, :, 0], share=0.5)
     assert (possible[rim] == 1).all()
     assert (members[object_] == 1).all()
     assert not members[rim].any()
-    assert (by_features(places, features_of(vectors), parts, vectors[None, :, 0], share=0.49)[0][rim] == 1).all()
+    members, _ = by_features(places, plain_features(vectors, SPACE), parts, vectors[None, :, 0], share=0.49)
+    assert (members[rim] == 1).all()
 
 
 def test_what_has_no_feature_could_be_of_the_first_of_the_words_within_reach() -> None:
@@ -159,7 +151,7 @@ def test_what_has_no_feature_could_be_of_the_first_of_the_words_within_reach() -
     vectors = np.eye(8)[np.where(left, 0, np.where(right, 1, 2))]
     blind = np.abs(places - [11, 11, 0]).max(axis=1) < 0.5
     parts = ((np.flatnonzero(left),), (np.flatnonzero(right),))
-    features = features_of(vectors, seen=~blind)
+    features = plain_features(vectors, SPACE, ~blind)
     for order in ([0, 1], [1, 0]):
         members, possible = by_features(
             places, features, tuple(parts[each] for each in order), vectors[:, order].T, reach=5.0
@@ -179,5 +171,5 @@ def test_all_boxes_of_a_word_are_one_object_whose_inside_stays() -> None:
     relevancy = vectors[:, 0].copy()
     vectors[stain] = np.eye(8)[1]
     parts = ((np.flatnonzero(one), np.flatnonzero(other)),)
-    members, _ = by_features(places, features_of(vectors), parts, relevancy[None])
+    members, _ = by_features(places, plain_features(vectors, SPACE), parts, relevancy[None])
     assert ((members == 1) == (one | other)).all()

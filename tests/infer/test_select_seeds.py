@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from feature_fields import answer_of, box_of
 from selected_rooms import EMBEDDINGS, selected_room, splat_of, words
 from viewed_targets import joined
 
@@ -12,7 +13,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer import select as module
 from gsencoder.infer.select import Parts, Votes, box_parts, find_holes, sample_views, select, threshold_parts, votes
-from gsencoder.types import Box, Cameras, Gaussians, Localization, Scene
+from gsencoder.types import Box, Cameras, Gaussians, Scene
 
 SCENE, KINDS = selected_room()
 LIKELY = (0.8, 0.4, 0.39)
@@ -20,28 +21,11 @@ LIKELY = (0.8, 0.4, 0.39)
 
 def box(rank: int, word: str = "mug") -> Box:
     """A box of two Gaussians, the larger row first."""
-    none = np.zeros(3)
-    return Box(
-        query=word,
-        rank=rank,
-        score=1.0 - rank,
-        probability=LIKELY[rank],
-        aabb_min=none,
-        aabb_max=none,
-        obb_center=none,
-        obb_rotation=np.eye(3),
-        obb_size=none,
-        rows=np.array([2 * rank + 1, 2 * rank]),
-    )
+    rows = np.array([2 * rank + 1, 2 * rank])
+    return box_of(word, rank, rows, score=1.0 - rank, probability=LIKELY[rank])
 
 
-FOUND = Localization(
-    queries=("mug", "book"),
-    relevancy=np.zeros((2, 8), np.float32),
-    thresholds=np.zeros(2, np.float32),
-    probabilities=np.array([0.8, 0.1], np.float32),
-    boxes=tuple(box(rank) for rank in range(3)),
-)
+FOUND = answer_of(("mug", "book"), np.zeros((2, 8), np.float32), tuple(box(rank) for rank in range(3)))
 
 
 def rows_of(parts: Parts) -> list[list[list[int]]]:
@@ -53,13 +37,7 @@ def test_boxes_that_are_nearly_as_probable_as_the_best_are_taken() -> None:
 
 
 def test_boxes_that_are_asked_for_by_number_are_taken_once_whatever_their_probability() -> None:
-    mug = Localization(
-        queries=("mug",),
-        relevancy=FOUND.relevancy[:1],
-        thresholds=FOUND.thresholds[:1],
-        probabilities=FOUND.probabilities[:1],
-        boxes=FOUND.boxes,
-    )
+    mug = answer_of(("mug",), FOUND.relevancy[:1], FOUND.boxes)
     assert rows_of(box_parts(mug, (2, 0, 2))) == [[[4, 5], [0, 1]]]
     with pytest.raises(InputError, match="box=3: 'mug' has 3 boxes, 0 to 2$"):
         box_parts(mug, (0, 3))

@@ -1,11 +1,11 @@
 """The share of an object in a feature: who is asked, and what stands for the object and for its surroundings."""
 
 import numpy as np
+from feature_fields import plain_features
 from scipy.spatial.distance import cdist
 from selected_rooms import SPACE
 
 from gsencoder.infer.select import object_shares
-from gsencoder.types import GaussianFeatures
 
 REACH, SPACING = 3.0, 1.1
 """The spacing is a little more than the step of the grid, so that the row beside a part is its rim."""
@@ -39,14 +39,8 @@ def shares(
     """The share of each Gaussian; −1 for those that are not asked. What was not seen has the relevancy `blank`."""
     seen = np.ones(len(places), bool) if seen is None else seen
     relevancy = vectors[:, 0] if relevancy is None else relevancy
-    features = GaussianFeatures(
-        features=(vectors * seen[:, None]).astype(np.float32),
-        weights=seen.astype(np.float32),
-        mean=np.zeros(8, np.float32),
-        space=SPACE,
-    )
     candidates, values = object_shares(
-        features,
+        plain_features(vectors * seen[:, None], SPACE, seen),
         places.astype(np.float32),
         np.flatnonzero(part),
         np.where(seen, relevancy, blank).astype(np.float32),
@@ -91,11 +85,8 @@ def test_surroundings_lie_between_one_spacing_and_twice_the_reach() -> None:
             # Seen from a corner of the part, so that the patch lies as far from all of it.
             corner = np.array([4.0, 4.0, 0.0])
             patch = corner + np.array(direction) * distance * SPACING + np.array([[0.01, 0, 0], [0, 0.01, 0]])
-            made = shares(
-                np.concatenate([alone, patch]),
-                np.concatenate([vectors, [TABLE, TABLE]]),
-                np.concatenate([part, [False, False]]),
-            )
+            with_patch = np.concatenate([vectors, [TABLE, TABLE]]), np.concatenate([part, [False, False]])
+            made = shares(np.concatenate([alone, patch]), *with_patch)
             expected = 0.3 if counts else 1.0
             np.testing.assert_allclose(made[: len(alone)][~part], np.full(rim, expected), atol=0.02)
     without = shares(alone, vectors, part, seen=np.arange(len(alone)) > 0)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from feature_fields import make_features
-from splats import front_camera, random_gaussians
+from feature_fields import make_features, plain_features
+from splats import front_camera, gaussians_at, random_gaussians
 from tiny_vlm import PATCH, SIDE, save_tiny_vlm, tokenizer
 
 from gsencoder.core.errors import InputError
@@ -73,13 +73,7 @@ def plates(grid: int, focal: float, pixels: float) -> Gaussians:
     at = (np.arange(grid) + 0.5) / grid - 0.5
     y, x = np.meshgrid(at, at, indexing="ij")
     means = np.stack([x.ravel() * SIDE / focal, y.ravel() * SIDE / focal, np.ones(grid * grid)], axis=1)
-    return Gaussians(
-        means=means.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (grid * grid, 1)),
-        scales=np.full((grid * grid, 3), pixels / focal, np.float32),
-        opacities=np.ones(grid * grid, np.float32),
-        sh=np.zeros((grid * grid, 1, 3), np.float32),
-    )
+    return gaussians_at(means, pixels / focal)
 
 
 @pytest.mark.slow
@@ -112,9 +106,7 @@ def test_a_model_answers_from_rendered_tokens_as_from_its_own_tower(tmp_path: Pa
     # One Gaussian for each patch that carries what the tower said of it.
     gaussians = plates(cells, 60.0, 4.0)
     space = FeatureSpace(name="tower", channels=32)
-    features = GaussianFeatures(
-        features=vectors, weights=np.ones(len(vectors), np.float32), mean=np.zeros(32, np.float32), space=space
-    )
+    features = plain_features(vectors, space)
     tokens = feature_tokens(token_blends(gaussians, front_camera(SIDE, SIDE, 60.0), (cells, cells)), features)
     assert tokens.shape == tower[0].shape
     cosines = torch.nn.functional.cosine_similarity(tokens[0], tower[0][0])

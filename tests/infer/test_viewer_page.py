@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from feature_fields import plain_features
 from viewed_rooms import HOSTILE, STUB, read_container, room_scene, save_viewed_room, search_of
 
 from gsencoder.core.errors import InputError
@@ -71,12 +72,7 @@ def written(search: SceneSearch) -> Container:
 
 
 def features_of(vectors: np.ndarray, weights: np.ndarray) -> GaussianFeatures:
-    return GaussianFeatures(
-        features=vectors.astype(np.float32),
-        weights=weights.astype(np.float32),
-        mean=np.zeros(6, np.float32),
-        space=SPACE,
-    )
+    return plain_features(vectors, SPACE, weights)
 
 
 def small_search(
@@ -330,13 +326,7 @@ def test_words_of_gaussians_are_weighed_and_the_same_where_features_lie_in_a_bas
         mean=np.zeros(6, np.float32), components=turn.T.astype(np.float32), energy_kept=1.0, space=SPACE
     )
     inside = vectors @ turn
-    features = GaussianFeatures(
-        features=inside.astype(np.float32),
-        weights=weights.astype(np.float32),
-        mean=np.zeros(6, np.float32),
-        space=SPACE,
-        basis=basis,
-    )
+    features = plain_features(inside, SPACE, weights, basis=basis)
     scene = replace(plain.shown.scene, features={"names": features})
     expected = small_search(inside @ turn.T, weights).best_words([0, 1, 2, 3])
     turned = replace_shown(plain, scene).best_words([0, 1, 2, 3])

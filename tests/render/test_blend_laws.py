@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from rooms import merged
 from splats import EXTREMES, dense, front_camera, one_gaussian, random_gaussians, random_rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import render_image
-from gsencoder.types import Cameras, Gaussians
 
 
 def test_rows_are_depth_ordered_and_sum_to_alpha() -> None:
@@ -60,18 +60,11 @@ def test_moving_scene_and_camera_together_changes_nothing() -> None:
     rotation = random_rotation(np.random.default_rng(1))
     shift = np.array([0.5, -1.0, 2.0])
     turned = Rotation.from_matrix(rotation) * Rotation.from_quat(g.quats[:, [1, 2, 3, 0]])
-    moved = Gaussians(
-        means=(g.means @ rotation.T + shift).astype(np.float32),
-        quats=turned.as_quat()[:, [3, 0, 1, 2]].astype(np.float32),
-        scales=g.scales,
-        opacities=g.opacities,
-        sh=g.sh,
-    )
+    quats = turned.as_quat()[:, [3, 0, 1, 2]].astype(np.float32)
+    moved = replace(g, means=(g.means @ rotation.T + shift).astype(np.float32), quats=quats)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ shift
-    seen = Cameras(
-        cam_from_world=pose[None].astype(np.float32), Ks=camera.Ks, widths=camera.widths, heights=camera.heights
-    )
+    seen = replace(camera, cam_from_world=pose[None].astype(np.float32))
     difference = np.abs(dense(blend(moved, seen)) - dense(blend(g, camera))).max(axis=1)
     assert np.quantile(difference, 0.98) < 1e-4
 
@@ -93,9 +86,7 @@ def test_reruns_give_the_same_bits_on_any_number_of_threads() -> None:
 
 def test_median_depth_is_where_half_the_light_is_lost() -> None:
     near, far = one_gaussian((0, 0, 1), 0.5, opacity=0.3), one_gaussian((0, 0, 4), 2.0, opacity=0.9)
-    both = Gaussians(
-        **{name: np.concatenate((getattr(near, name), getattr(far, name))) for name in Gaussians.__dataclass_fields__}
-    )
+    both = merged(near, far)
     b = blend(both, front_camera())
     assert float(b.median_depth[b.rows // 2]) == pytest.approx(4)
     assert float(blend(near, front_camera()).median_depth.max()) == 0

@@ -20,13 +20,8 @@ CPU, REFERENCE = RasterConfig(backend="cpu"), RasterConfig(backend="reference")
 
 def inputs_of(g: Gaussians, dtype: torch.dtype = torch.float64) -> Inputs:
     torch.manual_seed(0)
-    made = {
-        "means": torch.from_numpy(g.means),
-        "quats": torch.from_numpy(g.quats),
-        "scales": torch.from_numpy(g.scales),
-        "opacities": torch.from_numpy(g.opacities),
-        "colors": torch.rand(len(g), 3),
-    }
+    made = {name: torch.from_numpy(getattr(g, name)) for name in ("means", "quats", "scales", "opacities")}
+    made["colors"] = torch.rand(len(g), 3)
     return {name: value.to(dtype).requires_grad_() for name, value in made.items()}
 
 
@@ -142,20 +137,7 @@ def test_a_backend_for_another_device_is_refused() -> None:
 
 
 def stand_in(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
-    near_plane: float,
-    eps2d: float,
-    packed: bool,
-    render_mode: str,
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane, eps2d, packed, render_mode
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     assert (viewmats.shape, Ks.shape, packed, render_mode) == ((1, 4, 4), (1, 3, 3), False, "RGB+D")
     config = RasterConfig(near=near_plane, eps2d=eps2d, backend="reference")

@@ -27,11 +27,8 @@ def by_hand(folder: Path, prefix: str, version: str, inner: int, x: torch.Tensor
     """A head as NVlabs' modules define it, from the keys of the file alone."""
     from safetensors.torch import load_file
 
-    weights = {
-        key.removeprefix(prefix): value
-        for key, value in load_file(folder / "model.safetensors").items()
-        if key.startswith(prefix)
-    }
+    stored = load_file(folder / "model.safetensors")
+    weights = {key.removeprefix(prefix): value for key, value in stored.items() if key.startswith(prefix)}
 
     def linear(key: str, x: torch.Tensor) -> torch.Tensor:
         return functional.linear(x, weights[f"{key}.weight"], weights[f"{key}.bias"])
@@ -135,11 +132,7 @@ def drop(part: str) -> Any:
     return lambda weights: {key: value for key, value in weights.items() if part not in key}
 
 
-def add(key: str) -> Any:
-    return lambda weights: {**weights, key: torch.zeros(2)}
-
-
-def replaced(key: str, value: torch.Tensor) -> Any:
+def put(key: str, value: torch.Tensor = torch.zeros(2)) -> Any:
     return lambda weights: {**weights, key: value}
 
 
@@ -151,11 +144,17 @@ SUMMARY = "radio_model.adaptors.siglip.head_mlp."
     [
         (drop("siglip.head_mlp.blocks.1.0"), rf"2 of its weights are missing, too many, .*{SUMMARY}blocks\.1\.0\.bias"),
         (drop("siglip.head_mlp"), rf"config\.json states it, but no weights begin with {SUMMARY}"),
-        (add(f"{SUMMARY}blocks.2.0.weight"), r"1 of its weights are .* for a head of form v2: .*blocks\.2\.0"),
-        (add(f"{SUMMARY}fc1.parametrizations.weight.0.scale"), "are in spectral reparametrization, which is not supp"),
-        (replaced(f"{SUMMARY}fc1.weight", torch.zeros(20, 23)), r"1 of its weights are .*shapes .*fc1\.weight"),
-        (replaced(f"{SUMMARY}fc1.bias", torch.full((20,), torch.nan)), r"fc1\.bias has values that are not finite"),
-        (add("radio_model.feature_normalizer.mean"), "has a feature normalizer, which transformers does not apply"),
+        (put(f"{SUMMARY}blocks.2.0.weight"), r"1 of its weights are .* for a head of form v2: .*blocks\.2\.0"),
+        (
+            put(f"{SUMMARY}fc1.parametrizations.weight.0.scale"),
+            "are in spectral reparametrization, which is not supp",
+        ),
+        (put(f"{SUMMARY}fc1.weight", torch.zeros(20, 23)), r"1 of its weights are .*shapes .*fc1\.weight"),
+        (put(f"{SUMMARY}fc1.bias", torch.full((20,), torch.nan)), r"fc1\.bias has values that are not finite"),
+        (
+            put("radio_model.feature_normalizer.mean"),
+            "has a feature normalizer, which transformers does not apply",
+        ),
     ],
 )
 def test_weights_that_are_no_such_head_are_refused_by_name(tmp_path: Path, change: Any, message: str) -> None:

@@ -21,53 +21,26 @@ from gsencoder.teachers.regions import OnnxRegionOptions, RegionsConfig
 
 SIDE = 64
 POINTS = {"hidden_size": 16, "image_size": SIDE, "mask_input_channels": 4}
-DECODER = {
-    "hidden_size": 16,
-    "mlp_dim": 32,
-    "num_hidden_layers": 1,
-    "num_attention_heads": 2,
-    "iou_head_hidden_dim": 16,
-    "iou_head_depth": 2,
-}
+LAYERS = {"num_hidden_layers": 1, "num_attention_heads": 2}
+DECODER = {"hidden_size": 16, "mlp_dim": 32, "iou_head_hidden_dim": 16, "iou_head_depth": 2, **LAYERS}
 PARTS = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
 
 
 def sam() -> Any:
-    vision = {
-        "hidden_size": 16,
-        "output_channels": 16,
-        "num_hidden_layers": 1,
-        "num_attention_heads": 2,
-        "image_size": SIDE,
-        "patch_size": 8,
-        "mlp_dim": 32,
-        "num_pos_feats": 8,
-        "window_size": 4,
-        "global_attn_indexes": [0],
-    }
+    vision = {"hidden_size": 16, "output_channels": 16, "mlp_dim": 32, "num_pos_feats": 8, **LAYERS}
+    vision |= {"image_size": SIDE, "patch_size": 8, "window_size": 4, "global_attn_indexes": [0]}
     prompt = {**POINTS, "patch_size": 8, "image_embedding_size": 8}
     config = transformers.SamConfig(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=DECODER)
     return transformers.SamModel(config)
 
 
 def sam2() -> Any:
-    backbone = {
-        "model_type": "sam2_hiera_det_model",
-        "hidden_size": 8,
-        "image_size": [SIDE, SIDE],
-        "blocks_per_stage": [1, 1, 2, 1],
-        "embed_dim_per_stage": [8, 16, 32, 64],
-        "num_attention_heads_per_stage": [1, 1, 2, 2],
-        "window_size_per_stage": [8, 4, 4, 2],
-        "window_positional_embedding_background_size": [4, 4],
-        "global_attention_blocks": [3],
-    }
-    vision = {
-        "backbone_config": backbone,
-        "backbone_channel_list": [64, 32, 16, 8],
-        "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]],
-        "fpn_hidden_size": 32,
-    }
+    backbone = {"model_type": "sam2_hiera_det_model", "hidden_size": 8, "image_size": [SIDE, SIDE]}
+    backbone |= {"blocks_per_stage": [1, 1, 2, 1], "embed_dim_per_stage": [8, 16, 32, 64]}
+    backbone |= {"num_attention_heads_per_stage": [1, 1, 2, 2], "window_size_per_stage": [8, 4, 4, 2]}
+    backbone |= {"window_positional_embedding_background_size": [4, 4], "global_attention_blocks": [3]}
+    vision = {"backbone_config": backbone, "backbone_channel_list": [64, 32, 16, 8], "fpn_hidden_size": 32}
+    vision["backbone_feature_sizes"] = [[16, 16], [8, 8], [4, 4]]
     decoder = {**DECODER, "hidden_size": 32}
     prompt = {**POINTS, "hidden_size": 32, "patch_size": 16}
     config = transformers.Sam2Config(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder)
@@ -83,10 +56,8 @@ def saved(tmp_path: Path) -> Callable[[Callable[[], Any]], tuple[Path, Any]]:
         for mlp in model.mask_decoder.output_hypernetworks_mlps:
             mlp.proj_out.weight.data *= 100
         model.save_pretrained(tmp_path / "sam")
-        preprocessing = transformers.SamImageProcessor(
-            size={"longest_edge": SIDE}, pad_size={"height": SIDE, "width": SIDE}
-        )
-        preprocessing.save_pretrained(tmp_path / "sam")
+        square = {"height": SIDE, "width": SIDE}
+        transformers.SamImageProcessor(size={"longest_edge": SIDE}, pad_size=square).save_pretrained(tmp_path / "sam")
         return tmp_path / "sam", model
 
     return save
@@ -98,8 +69,7 @@ def masks_of(folder: Path, **options: Any) -> SamMasks:
 
 
 def photograph() -> np.ndarray:
-    views = region_scene().views
-    return views.images[0]
+    return region_scene().views.images[0]
 
 
 def full(proposal: Proposal, size: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
@@ -242,13 +212,12 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
     folder, _ = saved(sam)
     scene = region_scene()
     onnx = OnnxRegionOptions(layout="grid", patch=4, size=WIDTH, scale=1.0, mean=(0.0,) * 3, std=(1.0,) * 3)
-    options = {"model": str(save_colors(tmp_path / "net.onnx")), "onnx": onnx, "max_overlap": 0.5}
-    config = RegionsConfig(
-        masks="sam", vector="map", sam=str(folder), points=3, min_iou=0.0, min_stability=0.0, device="cpu", **options
-    )
+    thresholds = {"points": 3, "min_iou": 0.0, "min_stability": 0.0, "max_overlap": 0.5}
+    tower = {"model": str(save_colors(tmp_path / "net.onnx")), "onnx": onnx, "device": "cpu"}
+    config = RegionsConfig(masks="sam", vector="map", sam=str(folder), **tower, **thresholds)
     teacher = config.build(scene, None)
     made = teacher.feature_map(scene.views, 0)
-    options = SamOptions(points=3, min_iou=0.0, min_stability=0.0, max_overlap=0.5)
+    options = SamOptions(**thresholds)
     masks = SamMasks(str(folder), options, "cpu")
     labels = masks.labels(scene.views, 0)
     assert made.codes.max() >= 0
@@ -269,16 +238,10 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
 def test_the_published_form_of_sam2_a_model_of_videos_makes_masks_of_pictures(saved: Any) -> None:
     folder, model = saved(sam2)
     parts = {name: getattr(model.config, name).to_dict() for name in PARTS}
-    sizes = {
-        "memory_attention_hidden_size": 32,
-        "memory_attention_num_layers": 1,
-        "memory_attention_feed_forward_hidden_size": 32,
-        "memory_attention_rope_feat_sizes": [4, 4],
-        "memory_encoder_hidden_size": 32,
-        "memory_encoder_output_channels": 16,
-        "memory_fuser_embed_dim": 32,
-        "memory_fuser_intermediate_dim": 32,
-    }
+    wide = ("attention_hidden_size", "attention_feed_forward_hidden_size", "encoder_hidden_size", "fuser_embed_dim")
+    sizes = {f"memory_{name}": 32 for name in (*wide, "fuser_intermediate_dim")}
+    sizes |= {"memory_attention_num_layers": 1, "memory_encoder_output_channels": 16}
+    sizes["memory_attention_rope_feat_sizes"] = [4, 4]
     of_pictures = list(masks_of(folder).proposals(photograph()))
     video = transformers.Sam2VideoModel(transformers.Sam2VideoConfig(**parts, **sizes))
     assert not video.load_state_dict(model.state_dict(), strict=False).unexpected_keys
@@ -297,12 +260,11 @@ def test_folders_of_other_models_are_refused(saved: Any, tmp_path: Path) -> None
     with pytest.raises(InputError, match="holds a vit model, expected sam or sam2"):
         masks_of(tmp_path / "vit")
     folder, _ = saved(sam2)
-    (folder / "preprocessor_config.json").write_text(json.dumps({"image_mean": [0.5]}))
+    preprocessing = folder / "preprocessor_config.json"
+    preprocessing.write_text(json.dumps({"image_mean": [0.5]}))
     with pytest.raises(InputError, match="expected a filter of Pillow as resample"):
         masks_of(folder)
-    (folder / "preprocessor_config.json").write_text(
-        json.dumps({"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "resample": 2})
-    )
+    preprocessing.write_text(json.dumps({"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "resample": 2}))
     views = region_scene().views
     masks = masks_of(folder)
     masks._model.mask_decoder.iou_prediction_head.proj_out.bias.data[:] = torch.nan

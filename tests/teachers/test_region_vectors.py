@@ -171,14 +171,9 @@ def test_a_crop_is_the_box_of_the_region_in_a_gray_square(rng: np.random.Generat
 
 @pytest.mark.parametrize("around", ["picture", "nothing"])
 def test_crops_through_an_onnx_tower_are_its_pooled_output(tmp_path: Path, around: Any) -> None:
-    teacher = build(
-        write_masks(tmp_path / "m"),
-        save_pool(tmp_path / "net.onnx"),
-        "crop",
-        min_area=1,
-        around=around,
-        onnx=OnnxRegionOptions(size=16, **PLAIN),
-    )
+    masks, model = write_masks(tmp_path / "m"), save_pool(tmp_path / "net.onnx")
+    options = {"min_area": 1, "around": around, "onnx": OnnxRegionOptions(size=16, **PLAIN)}
+    teacher = build(masks, model, "crop", **options)
     scene = region_scene()
     table = made(teacher, 1).table
     for row, label in enumerate((1, 7)):
@@ -187,24 +182,22 @@ def test_crops_through_an_onnx_tower_are_its_pooled_output(tmp_path: Path, aroun
         np.testing.assert_allclose(table[row], mean / np.linalg.norm(mean), rtol=1e-5)
 
 
+SQUARE = {"height": 8, "width": 8}
+
+
 def joint_clip() -> Any:
-    config = transformers.CLIPConfig(
-        text_config={**TEXT, "projection_dim": 8}, vision_config={**VISION, "projection_dim": 8}, projection_dim=8
-    )
-    return transformers.CLIPModel(config), transformers.CLIPImageProcessor(
-        size={"shortest_edge": 8}, crop_size={"height": 8, "width": 8}
-    )
+    text, vision = ({**config, "projection_dim": 8} for config in (TEXT, VISION))
+    config = transformers.CLIPConfig(text_config=text, vision_config=vision, projection_dim=8)
+    return transformers.CLIPModel(config), transformers.CLIPImageProcessor(size={"shortest_edge": 8}, crop_size=SQUARE)
 
 
 def joint_siglip() -> Any:
     config = transformers.SiglipConfig(text_config={**TEXT, "projection_size": 16}, vision_config=VISION)
-    return transformers.SiglipModel(config), transformers.SiglipImageProcessor(size={"height": 8, "width": 8})
+    return transformers.SiglipModel(config), transformers.SiglipImageProcessor(size=SQUARE)
 
 
 def plain_vit() -> Any:
-    return transformers.ViTModel(transformers.ViTConfig(**VISION)), transformers.ViTImageProcessor(
-        size={"height": 8, "width": 8}
-    )
+    return transformers.ViTModel(transformers.ViTConfig(**VISION)), transformers.ViTImageProcessor(size=SQUARE)
 
 
 @pytest.mark.parametrize(("make", "joint"), [(joint_clip, True), (joint_siglip, True), (plain_vit, False)])
@@ -293,9 +286,7 @@ def test_no_end_of_a_square_is_cut_off_by_a_tower_that_crops(tmp_path: Path) -> 
         torch.manual_seed(0)
         model, _ = joint_clip()
         model.eval().save_pretrained(tmp_path / f"model{edge}")
-        processor = transformers.CLIPImageProcessor(
-            size={"shortest_edge": edge}, crop_size={"height": 8, "width": 8}, resample=2
-        )
+        processor = transformers.CLIPImageProcessor(size={"shortest_edge": edge}, crop_size=SQUARE, resample=2)
         processor.save_pretrained(tmp_path / f"model{edge}")
         words = toy_words("mug", "table", channels=8)
         teacher = build(masks, tmp_path / f"model{edge}", "crop", words, min_area=1, device="cpu")

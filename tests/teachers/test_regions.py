@@ -64,9 +64,8 @@ def test_captions_may_differ_from_view_to_view(tmp_path: Path) -> None:
     by_view = {"images/a.jpg": {"1": "lamp", "7": "table", "9": "mug"}, "b": {"1": "table", "7": "mug"}}
     teacher = captioned_teacher(scene, write_masks(tmp_path), by_view, rest="none")
     for view, captions in enumerate(by_view.values()):
-        np.testing.assert_allclose(
-            rows_of(teacher, scene, view), expected(view, captions, np.full(8, np.nan)), atol=1e-6
-        )
+        vectors = expected(view, captions, np.full(8, np.nan))
+        np.testing.assert_allclose(rows_of(teacher, scene, view), vectors, atol=1e-6)
 
 
 def test_instances_with_the_names_of_objects_are_what_the_labels_teacher_gives() -> None:
@@ -86,10 +85,8 @@ def test_instances_with_the_names_of_objects_are_what_the_labels_teacher_gives()
 
 
 def test_the_words_beside_the_features_hold_the_captions(tmp_path: Path) -> None:
-    save_tokenizer(
-        tmp_path / "tokenizer.json",
-        ("[PAD]", "[UNK]", "[CLS]", "[SEP]", *sorted(set(" ".join([*REFERENCE_NOUNS, "red on a"]).split()))),
-    )
+    letters = sorted(set(" ".join([*REFERENCE_NOUNS, "red on a"]).split()))
+    save_tokenizer(tmp_path / "tokenizer.json", ("[PAD]", "[UNK]", "[CLS]", "[SEP]", *letters))
     save_graph(tmp_path / "model.onnx", rows=1000)
     config = RegionsConfig(folder=str(write_masks(tmp_path / "masks")))
     words = words_of(config, OnnxTextConfig(model=str(tmp_path), pooling="mean"))
@@ -141,9 +138,7 @@ def test_label_images_are_called_like_their_views(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="view 'images/2.JPG' has 2 label images, .*2.png and .*2.safetensors"):
         label_paths(tmp_path, names)
     (tmp_path / "1.png").touch()
-    with pytest.raises(
-        InputError, match="2 of 3 views have no label image, first 'u/1.jpg'; expected u/1 with the ending"
-    ):
+    with pytest.raises(InputError, match="2 of 3 views have no label image, first 'u/1.jpg'; expected u/1 with the"):
         label_paths(tmp_path, ("x/1.jpg", "u/1.jpg", "v/1.jpg"))
     with pytest.raises(InputError, match="would belong to 2 views"):
         label_paths(tmp_path, ("x/1.jpg", "x/1.png"))
@@ -185,9 +180,7 @@ def test_captions_of_a_view_are_never_those_of_another_that_ends_alike(tmp_path:
 def test_regions_without_a_caption_are_counted_in_a_warning(tmp_path: Path, rest: Any) -> None:
     scene = region_scene()
     what = "no feature" if rest == "none" else "count as something else"
-    with pytest.warns(
-        SceneWarning, match=f"3 of 5 regions in 2 views have no caption and {what}; their labels are 7, 9"
-    ):
+    with pytest.warns(SceneWarning, match=f"3 of 5 regions in 2 views have no caption and {what}; .* labels are 7, 9"):
         teacher = captioned_teacher(scene, write_masks(tmp_path), {"1": "mug"}, rest=rest)
     codes = teacher.feature_map(scene.views, 0).codes
     assert (codes[labels_of(0) != 1] == (-1 if rest == "none" else 0)).all()

@@ -63,13 +63,10 @@ def save_graph(
     nodes += [helper.make_node("Transpose", ["float"], ["first"], perm=[0, 3, 1, 2])] * last
     nodes += [helper.make_node("Conv", ["first" if last else "float", "pick", "bias"], ["scores"], strides=[2, 2])]
     output = helper.make_tensor_value_info("scores", TensorProto.FLOAT, None)
-    weights = [
-        numpy_helper.from_array(pick, "pick"),
-        numpy_helper.from_array(np.array([0, 0, 0, fourth], np.float32), "bias"),
-    ]
-    graph = helper.make_graph(
-        nodes, "net", [helper.make_tensor_value_info("image", input_type, shape)], [output], weights
-    )
+    bias = np.array([0, 0, 0, fourth], np.float32)
+    weights = [numpy_helper.from_array(pick, "pick"), numpy_helper.from_array(bias, "bias")]
+    image = helper.make_tensor_value_info("image", input_type, shape)
+    graph = helper.make_graph(nodes, "net", [image], [output], weights)
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), path)
 
 
@@ -77,6 +74,8 @@ def teacher_of(
     path: Path, table: TextTable | OpenVocabulary, options: OnnxSegmenterOptions = PLAIN
 ) -> SegmenterTeacher:
     classes = path.with_name("classes.json")
+    if not path.exists():
+        save_graph(path)
     if not classes.exists():
         classes.write_text(json.dumps(NAMES))
     return SegmenterTeacher(SegmenterConfig(model=str(path), classes=str(classes), onnx=options), table)
@@ -122,28 +121,22 @@ def test_shares_are_the_posteriors_in_every_layout(tmp_path, rng, image, monkeyp
 
 
 def test_a_picture_of_another_size_is_squeezed_into_a_fixed_one(tmp_path: Path, rng: np.random.Generator) -> None:
-    save_graph(tmp_path / "net.onnx")
     made = teacher_of(tmp_path / "net.onnx", words(rng)).feature_map(views_of(np.zeros((20, 24, 3), np.uint8)), 0)
     np.testing.assert_allclose(made.grid_from_image, [[6 / 24, 0, 0], [0, 4 / 20, 0]])
 
 
 def test_classes_are_means_of_their_synonyms_and_nothing_is_the_mean_direction(tmp_path, rng):
-    save_graph(tmp_path / "net.onnx")
     table = words(rng)
     teacher = teacher_of(tmp_path / "net.onnx", table)
     row = dict(zip(table.names, table.embeddings, strict=True))
     expected = [table.mean, row["wall"], row["chair"] + row["seat"], row["table"]]
     np.testing.assert_allclose(teacher.table, unit(np.stack(expected)), atol=1e-6)
     assert teacher.kinds == ("wall", "chair", "seat", "table")
-    assert synonyms_of_classes(["door;double door", "side_walk", "Void "], ["void"]) == [
-        ["door", "double door"],
-        ["side walk"],
-        [],
-    ]
+    synonyms = synonyms_of_classes(["door;double door", "side_walk", "Void "], ["void"])
+    assert synonyms == [["door", "double door"], ["side walk"], []]
 
 
 def test_fusing_shares_equals_fusing_the_vectors_that_they_stand_for(tmp_path, rng, image):
-    save_graph(tmp_path / "net.onnx")
     teacher = teacher_of(tmp_path / "net.onnx", words(rng))
     scene = Scene(name="s", gaussians=random_gaussians(200), views=views_of(image))
 
@@ -164,7 +157,6 @@ def test_fusing_shares_equals_fusing_the_vectors_that_they_stand_for(tmp_path, r
 
 
 def test_a_mixed_map_comes_back_from_its_file(tmp_path: Path, rng: np.random.Generator, image: np.ndarray) -> None:
-    save_graph(tmp_path / "net.onnx")
     made = teacher_of(tmp_path / "net.onnx", words(rng)).feature_map(views_of(image), 0)
     write_map(tmp_path / "map.safetensors", made)
     again = read_map(tmp_path / "map.safetensors", made.space, made.table)
@@ -173,7 +165,6 @@ def test_a_mixed_map_comes_back_from_its_file(tmp_path: Path, rng: np.random.Gen
 
 
 def test_words_beside_the_features_hold_the_classes(tmp_path: Path) -> None:
-    save_graph(tmp_path / "net.onnx")
     vocabulary = make_vocabulary(HashTower(), "onnx", templates=("{}",))
     (tmp_path / "classes.json").write_text(json.dumps(["other", "wall", "zebra crossing", "table"]))
     beside = stored_words(teacher_of(tmp_path / "net.onnx", vocabulary), vocabulary)
@@ -184,11 +175,9 @@ def test_words_beside_the_features_hold_the_classes(tmp_path: Path) -> None:
 def test_words_beside_labels_hold_the_names_of_all_objects(tmp_path: Path) -> None:
     vocabulary = make_vocabulary(HashTower(), "onnx", templates=("{}",))
     assert vocabulary.table.find("abacus") is vocabulary.table.find("other") is None
-    objects = tuple(
-        SceneObject(id=row, name=name, aabb_min=np.zeros(3), aabb_max=np.ones(3))
-        for row, name in enumerate(("abacus", "zebra crossing"))
-    )
-    scene = Scene(name="s", objects=objects)
+    corners = {"aabb_min": np.zeros(3), "aabb_max": np.ones(3)}
+    things = enumerate(("abacus", "zebra crossing"))
+    scene = Scene(name="s", objects=tuple(SceneObject(id=row, name=name, **corners) for row, name in things))
     teacher = LabelsConfig().build(scene, vocabulary)
     beside = stored_words(teacher, vocabulary)
     assert beside.find("other") is None
@@ -198,10 +187,8 @@ def test_words_beside_labels_hold_the_names_of_all_objects(tmp_path: Path) -> No
 
 
 def test_a_segmenter_needs_a_model_words_and_pictures(tmp_path: Path, rng: np.random.Generator) -> None:
-    save_graph(tmp_path / "net.onnx")
-    config = SegmenterConfig(model=str(tmp_path / "net.onnx"))
     with pytest.raises(InputError, match="its classes need words"):
-        config.build(Scene(name="s"), None)
+        SegmenterConfig(model="net.onnx").build(Scene(name="s"), None)
     with pytest.raises(InputError, match="teacher.model= is missing"):
         SegmenterConfig().build(Scene(name="s"), words(rng))
 
@@ -261,7 +248,6 @@ def test_softmax_holds_at_the_extremes() -> None:
 
 def test_what_does_not_fit_is_one_line(tmp_path: Path, rng: np.random.Generator, image: np.ndarray) -> None:
     path, table = tmp_path / "net.onnx", words(rng)
-    save_graph(path)
     with pytest.raises(InputError, match="1 of 96 values are not finite"):
         _nan_teacher(path, table).feature_map(views_of(image), 0)
     (tmp_path / "classes.json").write_text('["wall", "chair"]')
@@ -297,68 +283,37 @@ def test_names_are_read_from_lists_objects_and_lines(tmp_path: Path) -> None:
     assert read_classes(tmp_path / "a.json") == read_classes(tmp_path / "b.txt") == ("a", "b")
 
 
+LABELS = {"id2label": dict(enumerate(NAMES)), "label2id": {name: row for row, name in enumerate(NAMES)}}
+QUERIES = {"num_queries": 5, "hidden_dim": 32, "encoder_layers": 1, "decoder_layers": 2, "num_attention_heads": 2}
+QUERIES |= {"encoder_feedforward_dim": 16, "dim_feedforward": 16, **LABELS}
+
+
 def small_segformer() -> Any:
-    config = transformers.SegformerConfig(
-        hidden_sizes=[8, 8, 8, 8],
-        depths=[1, 1, 1, 1],
-        num_attention_heads=[1, 1, 1, 1],
-        decoder_hidden_size=8,
-        id2label=dict(enumerate(NAMES)),
-        label2id={name: row for row, name in enumerate(NAMES)},
-    )
+    ones = {"depths": [1] * 4, "num_attention_heads": [1] * 4}
+    config = transformers.SegformerConfig(hidden_sizes=[8] * 4, decoder_hidden_size=8, **ones, **LABELS)
     return transformers.SegformerForSemanticSegmentation(config)
 
 
 def small_mask2former() -> Any:
-    backbone = transformers.SwinConfig(
-        embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 1, 1], window_size=4, image_size=64,
-        out_features=["stage1", "stage2", "stage3", "stage4"],
-    )  # fmt: skip
-    config = transformers.Mask2FormerConfig(
-        backbone_config=backbone,
-        hidden_dim=32,
-        feature_size=32,
-        mask_feature_size=32,
-        encoder_layers=1,
-        decoder_layers=2,
-        encoder_feedforward_dim=16,
-        dim_feedforward=16,
-        num_attention_heads=2,
-        num_queries=5,
-        id2label=dict(enumerate(NAMES)),
-        label2id={name: row for row, name in enumerate(NAMES)},
-    )
+    shape = {"embed_dim": 8, "depths": [1] * 4, "num_heads": [1] * 4, "window_size": 4, "image_size": 64}
+    backbone = transformers.SwinConfig(**shape, out_features=["stage1", "stage2", "stage3", "stage4"])
+    sizes = {"feature_size": 32, "mask_feature_size": 32}
+    config = transformers.Mask2FormerConfig(backbone_config=backbone, **sizes, **QUERIES)
     return transformers.Mask2FormerForUniversalSegmentation(config)
 
 
 def save_oneformer(folder: Path) -> tuple[Any, Any]:
     """A small OneFormer; its preprocessing names a list of classes in another repository, as published ones do."""
-    config = transformers.OneFormerConfig(
-        backbone_config=small_mask2former().config.backbone_config,
-        hidden_dim=32,
-        conv_dim=32,
-        mask_dim=32,
-        encoder_layers=1,
-        decoder_layers=2,
-        encoder_feedforward_dim=16,
-        dim_feedforward=16,
-        num_attention_heads=2,
-        num_queries=5,
-        query_dec_layers=1,
-        text_encoder_width=16,
-        text_encoder_num_layers=1,
-        text_encoder_vocab_size=30,
-        text_encoder_n_ctx=4,
-        task_seq_len=12,
-        id2label=dict(enumerate(NAMES)),
-        label2id={name: row for row, name in enumerate(NAMES)},
-    )
+    text = {"width": 16, "num_layers": 1, "vocab_size": 30, "n_ctx": 4}
+    text = {f"text_encoder_{name}": value for name, value in text.items()}
+    sizes = {"conv_dim": 32, "mask_dim": 32, "query_dec_layers": 1, "task_seq_len": 12}
+    backbone = small_mask2former().config.backbone_config
+    config = transformers.OneFormerConfig(backbone_config=backbone, **sizes, **text, **QUERIES)
     model = transformers.OneFormerForUniversalSegmentation(config).eval()
     model.save_pretrained(folder)
     save_tokenizer(folder / "tokenizer.json", ("[PAD]", "[UNK]", "[CLS]", "[SEP]", "the", "task", "is", "semantic"))
-    (folder / "tokenizer_config.json").write_text(
-        json.dumps({"tokenizer_class": "PreTrainedTokenizerFast", "pad_token": "[PAD]", "unk_token": "[UNK]"})
-    )
+    tokens = {"tokenizer_class": "PreTrainedTokenizerFast", "pad_token": "[PAD]", "unk_token": "[UNK]"}
+    (folder / "tokenizer_config.json").write_text(json.dumps(tokens))
     images = transformers.OneFormerImageProcessorPil(size={"shortest_edge": 40, "longest_edge": 80})
     images.save_pretrained(folder)
     written = folder / "preprocessor_config.json"
@@ -377,11 +332,10 @@ def semantic_shares(outputs: Any) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_gpu")
-@pytest.mark.parametrize("size", [(64, 48)])
-def test_a_oneformer_gives_the_semantic_map_of_its_library_and_fetches_no_list_of_classes(tmp_path, rng, size):
+def test_a_oneformer_gives_the_semantic_map_of_its_library_and_fetches_no_list_of_classes(tmp_path, rng):
     torch.manual_seed(0)
     model, processor = save_oneformer(tmp_path)
-    image = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
+    image = rng.integers(0, 256, (64, 48, 3)).astype(np.uint8)
     made = SegmenterTeacher(SegmenterConfig(model=str(tmp_path)), words(rng)).feature_map(views_of(image), 0)
     inputs = processor(images=image, task_inputs=["semantic"], return_tensors="pt")
     assert (inputs["task_inputs"] > 0).sum() >= 4
@@ -410,14 +364,13 @@ def test_a_segformer_equals_a_direct_call_of_its_library(tmp_path, rng, size):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_gpu")
-@pytest.mark.parametrize("size", [(64, 48)])
-def test_a_mask2former_gives_the_semantic_map_of_its_library_without_the_padding(tmp_path, rng, size):
+def test_a_mask2former_gives_the_semantic_map_of_its_library_without_the_padding(tmp_path, rng):
     torch.manual_seed(0)
     model = small_mask2former().eval()
     model.save_pretrained(tmp_path)
     processor = transformers.Mask2FormerImageProcessorPil(size={"shortest_edge": 40, "longest_edge": 80})
     processor.save_pretrained(tmp_path)
-    image = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
+    image = rng.integers(0, 256, (64, 48, 3)).astype(np.uint8)
     made = SegmenterTeacher(SegmenterConfig(model=str(tmp_path)), words(rng)).feature_map(views_of(image), 0)
     inputs = processor(images=image, return_tensors="pt")
     with torch.inference_mode():
@@ -425,7 +378,5 @@ def test_a_mask2former_gives_the_semantic_map_of_its_library_without_the_padding
     np.testing.assert_allclose(made.shares, semantic_shares(outputs), atol=1e-5)
     mask = inputs["pixel_mask"][0]
     height, width = int(mask[:, 0].sum()), int(mask[0].sum())
-    corner = made.grid_from_image @ [size[1], size[0], 1]
-    np.testing.assert_allclose(
-        corner, [width / mask.shape[1] * made.width, height / mask.shape[0] * made.height], rtol=1e-6
-    )
+    end = [width / mask.shape[1] * made.width, height / mask.shape[0] * made.height]
+    np.testing.assert_allclose(made.grid_from_image @ [48, 64, 1], end, rtol=1e-6)

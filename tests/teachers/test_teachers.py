@@ -25,13 +25,8 @@ from gsencoder.types import Scene, SceneObject, Views
 
 def views_of(image: np.ndarray | None = None, instances: np.ndarray | None = None) -> Views:
     array = image if image is not None else instances
-    cameras = front_camera(array.shape[1], array.shape[0])
-    return Views(
-        cameras=cameras,
-        names=("a",),
-        images=None if image is None else [image],
-        instances=None if instances is None else [instances],
-    )
+    images, maps = (None if each is None else [each] for each in (image, instances))
+    return Views(cameras=front_camera(array.shape[1], array.shape[0]), names=("a",), images=images, instances=maps)
 
 
 @pytest.mark.parametrize(
@@ -54,11 +49,8 @@ def test_the_palette_calls_css_colors_by_their_names(rgb: tuple[int, int, int], 
 def test_shares_of_color_names_fall_with_the_squared_distance_to_the_nearest_color_of_each_name(rng):
     rgb, teacher = rng.integers(0, 256, (500, 3)).astype(np.uint8), PaletteTeacher()
     for row, shares in zip(lab_from_rgb(rgb), teacher.name_shares(rgb), strict=True):
-        squares = [
-            min(float(((lab_from_rgb(np.uint8(color)) - row) ** 2).sum()) for color in colors)
-            for colors in _PROTOTYPES.values()
-        ]
-        weights = np.exp(-np.array(squares) / (2 * SOFTNESS**2))
+        away = [((lab_from_rgb(np.uint8(colors)) - row) ** 2).sum(axis=-1).min() for colors in _PROTOTYPES.values()]
+        weights = np.exp(-np.array(away, float) / (2 * SOFTNESS**2))
         np.testing.assert_allclose(shares, weights / weights.sum(), atol=1e-5)
 
 
@@ -114,14 +106,7 @@ def write_mean_model(path: Path, patch: int = 4) -> None:
 
 
 def onnx_config(path: Path, **options: object) -> OnnxConfig:
-    values = {
-        "model": str(path),
-        "patch": 4,
-        "size": 32,
-        "skip_tokens": 1,
-        "mean": (0.0, 0.0, 0.0),
-        "std": (1.0, 1.0, 1.0),
-    }
+    values = {"model": str(path), "patch": 4, "size": 32, "skip_tokens": 1, "mean": (0.0,) * 3, "std": (1.0,) * 3}
     return OnnxConfig(**{**values, **options})  # type: ignore[arg-type]
 
 

@@ -130,26 +130,22 @@ def test_each_teacher_with_classes_has_a_contrast(clusters, expected, datasets, 
 def test_scenes_are_numbered_by_name_each_with_its_own_parts_and_others_are_validated(datasets, tmp_path, monkeypatch):
     data, validated, _ = begin(datasets, ["wall_2", "wall_0"], tmp_path, monkeypatch)
     assert [scene.name for scene in data.scenes] == ["wall_0", "wall_2"]
-    assert [[part.name if part else None for part in scene.parts] for scene in data.scenes] == [
-        ["wall_0", "wall_0"],
-        ["wall_2", None],
-    ]
+    parts = [[part.name if part else None for part in scene.parts] for scene in data.scenes]
+    assert parts == [["wall_0", "wall_0"], ["wall_2", None]]
     assert validated == ["wall_1"]
 
 
 def test_the_heads_of_the_render_loss_go_to_the_teacher_that_has_them(datasets, tmp_path, monkeypatch):
     assert begin(datasets, ["wall_0"], tmp_path, monkeypatch)[2] == {}
-    head = Head(name="siglip.summary", body=torch.nn.Sequential(torch.nn.Linear(4, 3)))
-    measured = MeasuredHead(head=head, mean=np.arange(3, dtype=np.float32), scale=2.0, cells=5, cosine=0.9, worst=0.5)
-    path = datasets["dense"].folder / HEADS_FILE
-    save_heads(path, HeadSet(space=DenseTeacher.space, heads=(measured,)))
+    own, path = measured("siglip.summary", 3, inputs=4), datasets["dense"].folder / HEADS_FILE
+    save_heads(path, HeadSet(space=DenseTeacher.space, heads=(own,)))
     *_, heads = begin(datasets, ["wall_0"], tmp_path, monkeypatch, heads=("siglip.summary",))
     path.unlink()
     ((adapter, decode),) = heads["dense"]
     assert list(heads) == ["dense"]
     outputs, vectors = datasets["dense"].load_space()[0], torch.randn(5, 4)
     standard = torch.from_numpy(outputs.standardize(vectors.numpy()))
-    expected = (head.body(vectors) - torch.arange(3)) / (2.0 / 3**0.5)
+    expected = (own.head.body(vectors) - torch.arange(3)) / (2.0 / 3**0.5)
     torch.testing.assert_close(adapter(decode(standard)), expected, rtol=1e-4, atol=1e-4)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from splats import front_camera, random_gaussians
+from splats import dense, front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import blend
@@ -45,14 +45,6 @@ def test_without_confidence_the_matching_loss_is_equation_three_for_targets_of_a
         assert gradient[row, channel].item() == pytest.approx(slope, rel=1e-3, abs=1e-5)
 
 
-def test_without_division_by_alpha_composited_features_are_compared() -> None:
-    b = blend(random_gaussians(60), front_camera(), patch=8)
-    predicted, target, weights = torch.randn(60, 8), typical(b.rows), (b.alpha > 0.3).float()
-    loss = render_loss(predicted, b, target, weights, replace(CONFIG, divide_by_alpha=False))
-    torch.testing.assert_close(loss, (match_loss(b.render(predicted), target, CONFIG) * weights).sum())
-    assert not torch.isclose(loss, render_loss(predicted, b, target, weights, CONFIG))
-
-
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0, 3.0])
 def test_near_the_mean_the_direction_counts_in_proportion_and_beyond_it_not_more(share: float) -> None:
     target, predicted = typical(4) * share, torch.randn(4, 8)
@@ -75,18 +67,15 @@ def test_gaussians_that_were_never_seen_neither_cost_nor_learn() -> None:
     assert torch.isfinite(field_loss(predicted, spoiled, weights, CONFIG))
 
 
-def test_the_render_loss_compares_what_is_left_after_dividing_by_alpha() -> None:
-    cloud, camera = random_gaussians(60), front_camera()
-    b = blend(cloud, camera, patch=8)
+@pytest.mark.parametrize("divided", [True, False])
+def test_the_render_loss_compares_composited_features_divided_by_alpha_or_as_they_are(divided: bool) -> None:
+    b = blend(random_gaussians(60), front_camera(), patch=8)
     predicted = torch.randn(60, 8, requires_grad=True)
-    rows = b.alpha > 0.3
-    weights = rows.float()
-    target = typical(b.rows)
-    dense = torch.zeros(b.rows, 60)
-    dense[torch.repeat_interleave(torch.arange(b.rows), b.crow.diff()), b.col.long()] = b.weight
-    rendered = (dense @ predicted) / b.alpha.clamp(min=1e-12)[:, None]
+    weights, target = (b.alpha > 0.3).float(), typical(b.rows)
+    rendered = torch.from_numpy(dense(b)).float() @ predicted
+    rendered = rendered / b.alpha.clamp(min=1e-12)[:, None] if divided else rendered
     expected = (match_loss(rendered, target, CONFIG) * weights).sum()
-    loss = render_loss(predicted, b, target, weights, CONFIG)
+    loss = render_loss(predicted, b, target, weights, replace(CONFIG, divide_by_alpha=divided))
     torch.testing.assert_close(loss, expected, rtol=1e-4, atol=1e-4)
     ours = torch.autograd.grad(loss, [predicted])[0]
     plain = torch.autograd.grad(expected, [predicted])[0]
@@ -147,6 +136,10 @@ def test_unseen_gaussians_have_no_kind_and_no_part_in_the_contrast() -> None:
 def test_a_loss_of_no_term_and_a_temperature_of_zero_are_refused() -> None:
     with pytest.raises(InputError, match="_weight: expected one above 0"):
         LossConfig(field_weight=0.0, render_weight=0.0)
+    with pytest.raises(InputError, match="cosine and smooth_l1"):
+        LossConfig(cosine=0.0, smooth_l1=0.0)
+    for cosine, smooth, contrast in ((0.0, 1e-3, 0.0), (1e-3, 0.0, 0.0), (0.0, 0.0, 1.0)):
+        LossConfig(cosine=cosine, smooth_l1=smooth, contrast_weight=contrast)
     LossConfig(field_weight=0.0, render_weight=0.0, contrast_weight=1.0)
     with pytest.raises(InputError, match="temperature"):
         LossConfig(temperature=0.0)
@@ -160,11 +153,3 @@ def test_a_head_gives_standard_units_of_its_own_space() -> None:
     outputs = AdapterHead(torch.nn.Identity(), mean.float(), scale)(vectors.float())
     torch.testing.assert_close(outputs.double(), (vectors - mean) / scale * 6**0.5, rtol=1e-4, atol=1e-5)
     assert abs(outputs.square().mean() - 1) < 1e-4
-
-
-def test_a_matching_loss_needs_one_of_its_parts_unless_there_is_a_contrast() -> None:
-    assert LossConfig(cosine=0.0, smooth_l1=1e-3).cosine == 0
-    assert LossConfig(cosine=1e-3, smooth_l1=0.0).smooth_l1 == 0
-    assert LossConfig(cosine=0.0, smooth_l1=0.0, contrast_weight=1.0).cosine == 0
-    with pytest.raises(InputError, match="cosine and smooth_l1"):
-        LossConfig(cosine=0.0, smooth_l1=0.0)

@@ -16,7 +16,7 @@ from memory_scenes import PREPARE as MEMORY_PREPARE
 from memory_scenes import BlendedTeacher
 from pretend_device import pretended_device
 from safetensors.numpy import load_file
-from training_scenes import PREPARE, SPACE, TABLE, DenseSideTeacher, SideTeacher, prepared, samples, scene
+from training_scenes import PREPARE, TABLE, DenseSideTeacher, SideTeacher, prepared, samples, scene
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import plain
@@ -96,6 +96,8 @@ def test_what_is_prepared_is_not_prepared_again(tmp_path: Path) -> None:
     assert [path.read_bytes() for path in files] == before
     assert again.has_scene(Path(names[0]))
     assert not again.has_scene(Path("wall_7"))
+    with pytest.raises(InputError, match=r"prepared with made="):
+        PreparedDataset(tmp_path, {"made": "otherwise"})
 
 
 def test_a_scene_that_was_moved_is_recognized_by_its_files(tmp_path: Path) -> None:
@@ -115,12 +117,6 @@ def test_a_scene_that_was_moved_is_recognized_by_its_files(tmp_path: Path) -> No
     (moved / "more.jpg").touch()
     with pytest.raises(InputError, match="was prepared from"):
         dataset.has_scene(moved)
-
-
-def test_a_folder_of_another_dataset_is_refused_and_the_setting_named(tmp_path: Path) -> None:
-    prepared(tmp_path, count=1)
-    with pytest.raises(InputError, match=r"prepared with made="):
-        PreparedDataset(tmp_path, {"made": "otherwise"})
 
 
 def look_at_all(one: PreparedScene) -> None:
@@ -177,23 +173,20 @@ def test_maps_of_a_killed_run_are_neither_used_nor_left(tmp_path: Path) -> None:
     assert not maps.exists()
 
 
-def test_scenes_of_two_spaces_are_refused() -> None:
+def test_scenes_of_two_spaces_none_and_a_teacher_that_says_the_same_everywhere_are_refused() -> None:
     class Other(SideTeacher):
         space = FeatureSpace(name="other", channels=4)
+
+    class Blind(DenseSideTeacher):
+        def feature_map(self, views: Views, view: int) -> FeatureMap:
+            seen = super().feature_map(views, view)
+            return replace(seen, features=np.ones_like(seen.features))
 
     teachers = iter([SideTeacher(), Other()])
     with pytest.raises(InputError, match="several feature spaces"):
         dataset_space([Path("a"), Path("b")], lambda path: (scene(0), next(teachers)), PREPARE)
     with pytest.raises(InputError, match="no scenes"):
         dataset_space([], lambda path: (scene(0), SideTeacher()), PREPARE)
-
-
-def test_a_teacher_that_says_the_same_everywhere_is_refused() -> None:
-    class Blind(DenseSideTeacher):
-        def feature_map(self, views: Views, view: int) -> FeatureMap:
-            seen = super().feature_map(views, view)
-            return replace(seen, features=np.ones_like(seen.features))
-
     with pytest.raises(InputError, match="gives the same features everywhere"):
         dataset_space([Path("a")], lambda path: (scene(0), Blind()), PREPARE)
 
@@ -272,9 +265,7 @@ class CornerTeacher(SideTeacher):
         height, width = int(views.cameras.heights[view]), int(views.cameras.widths[view])
         codes = np.full((height, width), 2, np.int32)
         codes[height - 12 :, : width // 2] = 1
-        return FeatureMap(
-            codes=codes, table=TABLE, grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]), space=self.space
-        )
+        return replace(super().feature_map(views, view), codes=codes)
 
 
 def test_cells_of_the_render_loss_lie_where_their_pixels_do(tmp_path: Path) -> None:
@@ -316,8 +307,7 @@ class UnevenTeacher(DenseSideTeacher):
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         noise = np.random.default_rng(view).normal(size=(20, 24, 4)) * [10, 1, 0.1, 0.01]
-        grid = np.array([[0.5, 0, 0], [0, 0.5, 0]])
-        return FeatureMap(features=noise.astype(np.float32), grid_from_image=grid, space=SPACE)
+        return replace(super().feature_map(views, view), features=noise.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -397,8 +387,7 @@ class NoiseTeacher(DenseSideTeacher):
             self.made.append(self.number)
         rng = np.random.default_rng([self.number, view])
         features = (50 + self.number + rng.normal(size=(20, 24, CHANNELS)) @ np.diag(np.arange(CHANNELS) + 1)) / 10
-        grid = np.array([[0.5, 0, 0], [0, 0.5, 0]])
-        return FeatureMap(features=features.astype(np.float32), grid_from_image=grid, space=self.space)
+        return replace(super().feature_map(views, view), features=features.astype(np.float32), space=self.space)
 
 
 class NamedTeacher(SideTeacher):
@@ -442,6 +431,10 @@ def test_the_basis_is_of_the_maps_of_the_scenes_that_have_the_teacher(monkeypatc
     assert outputs.scale**2 == pytest.approx(np.trace(np.cov(every.T, bias=True)), rel=1e-5)
     values, vectors = np.linalg.eigh(np.cov(every.T, bias=True))
     np.testing.assert_allclose(np.abs(outputs.basis.components[0] @ vectors[:, values.argmax()]), 1, atol=1e-4)
+    with pytest.raises(MissingInput, match="no scene to train on has what it needs; the first one: .*no labels"):
+        dataset_space(WALLS[:1], open_scene, config, optional=True)
+    with pytest.raises(MissingInput, match="no labels"):
+        dataset_space(WALLS, open_scene, config)
 
 
 LACKING = {"coded": {"wall_1"}, "dense": {"wall_0", "wall_3"}}

@@ -80,10 +80,8 @@ def test_processes_share_a_step_and_a_resumed_run_goes_on_in_the_middle(batch, a
 def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[PreparedDataset, list[str]]) -> None:
     whole = SamplingConfig(gaussians=0, views=2)
     data = samples(*dataset, augmentation=None, sampling=whole)
-    sample, source = data[0], None
-    for scene in data.scenes:
-        if sample.name.startswith(scene.name):
-            source = scene
+    sample = data[0]
+    source = next(scene for scene in data.scenes if sample.name.startswith(scene.name))
     assert len(sample.attributes) == len(source.first)
     everything = np.arange(len(source.first))
     (targets,), (part,) = sample.teachers, source.parts
@@ -161,9 +159,8 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(dataset
     np.testing.assert_array_equal(codes, expected)
     (targets,) = SampleDataset([TrainingScene([scene])], recipe)[0].teachers
     np.testing.assert_array_equal(targets.codes.numpy(), expected)
-    np.testing.assert_array_equal(
-        targets.loss_weights.numpy(), np.where(expected < 0, 0, balance.class_weights(power)[expected])
-    )
+    weights = np.where(expected < 0, 0, balance.class_weights(power)[expected])
+    np.testing.assert_array_equal(targets.loss_weights.numpy(), weights)
 
 
 @pytest.mark.parametrize(
@@ -259,13 +256,10 @@ def test_samples_side_by_side_are_the_samples_alone(dataset: tuple[PreparedDatas
     torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-5)
 
 
-def test_no_scenes_are_refused(dataset: tuple[PreparedDataset, list[str]]) -> None:
-    with pytest.raises(InputError, match="no scenes"):
-        SampleDataset([], samples(*dataset).recipe)
-
-
-def test_views_that_see_nothing_are_named(dataset: tuple[PreparedDataset, list[str]]) -> None:
+def test_no_scenes_and_views_that_see_nothing_are_refused(dataset: tuple[PreparedDataset, list[str]]) -> None:
     data = samples(*dataset)
+    with pytest.raises(InputError, match="no scenes"):
+        SampleDataset([], data.recipe)
     scene = data.scenes[0]
     (part,) = scene.parts
     part._header[0].cam_from_world[:, 2, 3] -= 1000  # Both cameras now stand behind the wall and look away.
@@ -438,11 +432,10 @@ def test_heads_of_a_teacher_are_in_its_render_loss_and_in_no_other_term(datasets
     predicted = torch.randn(len(batch.attributes), 8)
     torch.manual_seed(5)
     heads = [(AdapterHead(torch.nn.Linear(4, 3), torch.zeros(3), 1.0), torch.nn.Identity())]
-    plain = Distillation(small_encoder(8), LOSSES, data.recipe.teachers).terms(predicted, batch)
+    encoder, teachers = small_encoder(8), data.recipe.teachers
+    plain = Distillation(encoder, LOSSES, teachers).terms(predicted, batch)
     for number, name in enumerate(datasets):
-        terms = Distillation(small_encoder(8), LOSSES, data.recipe.teachers, heads={name: heads}).terms(
-            predicted, batch
-        )
+        terms = Distillation(encoder, LOSSES, teachers, heads={name: heads}).terms(predicted, batch)
         rows, own = batch.teachers[number].rows, predicted.split([4, 4], dim=1)[number]
         expected = render_loss(own, rows.blend(len(own)), rows.targets, rows.row_weights, LOSSES, heads)
         torch.testing.assert_close(terms[f"{name}/render"], expected)

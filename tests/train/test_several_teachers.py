@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 from joint_training import Datasets, HeightTeacher, batch_of, joint
-from training_scenes import LOSSES, PREPARE, SHORT, SideTeacher, prepared, samples, scene, small_encoder
+from training_scenes import LOSSES, PREPARE, SHORT, SideTeacher, made, prepared, samples, scene, small_encoder
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.core.process import untracked
 from gsencoder.core.settings import first_difference
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.train.loop import (
     TRAINING_CHECKPOINT_FILE,
@@ -26,7 +25,7 @@ from gsencoder.train.loop import (
     save_checkpoint,
 )
 from gsencoder.train.losses import Distillation
-from gsencoder.train.prepare import add_scene, dataset_space
+from gsencoder.train.prepare import add_scene
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
 from gsencoder.train.prepared import PreparedDataset
 from gsencoder.train.run import TrainConfig, encoder_trainer, resume_settings, train
@@ -92,17 +91,13 @@ def test_a_scene_that_lacks_a_teacher_has_no_weight_in_its_terms(datasets: Datas
 
 
 def test_the_log_averages_a_teachers_losses_over_the_steps_that_have_it(datasets: Datasets, tmp_path: Path) -> None:
-    config = replace(SHORT, steps=6, log_every=3)
-    data = joint(datasets)
-    each = encoder_trainer(
-        small_encoder(8), data, LOSSES, replace(config, log_every=1), folder=_made(tmp_path / "1"), settings={}
-    )
-    each.run()
-    single = read_log(tmp_path / "1" / LOG_FILE)
+    config, data = replace(SHORT, steps=6), joint(datasets)
+    for every in (1, 3):
+        settings = {"folder": made(tmp_path / str(every)), "settings": {}}
+        encoder_trainer(small_encoder(8), data, LOSSES, replace(config, log_every=every), **settings).run()
+    single, rows = (read_log(tmp_path / every / LOG_FILE) for every in ("1", "3"))
     lacking = [row for row in single if not row.get("heights/field")]
     assert len(lacking) == 2  # One wall of three.
-    encoder_trainer(small_encoder(8), data, LOSSES, config, folder=_made(tmp_path / "3"), settings={}).run()
-    rows = read_log(tmp_path / "3" / LOG_FILE)
     assert len(rows) == 2
     for row, group in zip(rows, (single[:3], single[3:]), strict=True):
         for name in ("heights/field", "sides/render", "loss"):
@@ -132,13 +127,8 @@ def test_a_run_goes_on_only_with_its_teachers_in_their_order(datasets: Datasets)
     assert first != resume_settings(config, opened, ["wall_0", "wall_1"], "")
 
 
-def _made(folder: Path) -> Path:
-    folder.mkdir(exist_ok=True)
-    return folder
-
-
 def test_other_teachers_than_those_of_a_checkpoint_are_refused_before_and_after_preparation(tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint.safetensors"
+    path = tmp_path / TRAINING_CHECKPOINT_FILE
     check_same_teachers(path, ["a", "b", "c"])
     encoder = small_encoder()
     optimizer = torch.optim.AdamW(encoder.parameters())
@@ -151,13 +141,6 @@ def test_other_teachers_than_those_of_a_checkpoint_are_refused_before_and_after_
             check_same_teachers(path, asked)
         with pytest.raises(InputError, match=message):
             load_checkpoint(path, encoder, optimizer, {"teachers": asked, "spaces": {}})
-
-
-def test_a_run_with_another_list_of_teachers_is_refused_before_anything_is_prepared(tmp_path: Path) -> None:
-    encoder = small_encoder()
-    optimizer = torch.optim.AdamW(encoder.parameters())
-    made_with = {"teachers": ["a", "b"]}
-    save_checkpoint(tmp_path / TRAINING_CHECKPOINT_FILE, encoder, optimizer, TrainingState(step=1), made_with)
     config = TrainConfig(teachers={name: PaletteConfig() for name in "abc"})
     with pytest.raises(InputError, match="and this run asks teachers="):
         train([tmp_path / "nowhere"], config, work=tmp_path, device="cpu")
@@ -217,30 +200,12 @@ def test_scenes_without_a_teacher_and_teachers_without_a_scene_are_reported(data
         _check_teachers(opened, walls[:1], walls[1:2])
 
 
-def test_the_space_is_that_of_the_scenes_that_have_the_teacher() -> None:
-    def open_scene(path: Path) -> tuple[object, object]:
-        if path.name == "bare":
-            raise MissingInput("the scene has no labels")
-        return scene(0), HeightTeacher()
-
-    outputs, _, _ = dataset_space([Path("bare"), Path("a")], open_scene, PREPARE, optional=True)  # type: ignore[arg-type]
-    expected, _, _ = dataset_space([Path("a")], open_scene, PREPARE)  # type: ignore[arg-type]
-    np.testing.assert_allclose(outputs.mean, expected.mean, atol=1e-6)
-    with pytest.raises(MissingInput, match="no scene to train on has what it needs; the first one: .* no labels"):
-        dataset_space([Path("bare")], open_scene, PREPARE, optional=True)  # type: ignore[arg-type]
-    with pytest.raises(MissingInput, match="no labels"):
-        dataset_space([Path("bare"), Path("a")], open_scene, PREPARE)  # type: ignore[arg-type]
-
-
-def test_scenes_prepared_for_one_teacher_are_not_taken_for_those_of_several(datasets: Datasets) -> None:
+def test_scenes_prepared_for_one_teacher_are_not_taken_for_those_of_several_or_the_other_way_around(datasets):
     folder = datasets["sides"][0].folder
     assert teacher_folders(folder, ["sides"]) == {"sides": folder}
     with pytest.raises(InputError, match="was prepared for one teacher, and this run has several"):
         teacher_folders(folder, ["sides", "heights"])
-
-
-def test_scenes_prepared_for_several_teachers_are_not_taken_for_those_of_one(datasets: Datasets) -> None:
-    folder = datasets["sides"][0].folder.parent
+    folder = folder.parent
     assert set(teacher_folders(folder, ["sides", "heights"])) == {"sides", "heights"}
     for name, own in (("sides", "sides"), ("colors", "heights")):
         message = rf"was prepared for several teachers \(heights, sides\), and this run has one; .*/{own}\)"

@@ -21,10 +21,12 @@ from training_scenes import (
     Prepared,
     assert_same_weights,
     losses,
+    made,
     rows,
     samples,
     small_encoder,
     steps_in,
+    stop_at,
     trainer,
     weights_in,
 )
@@ -76,35 +78,17 @@ def test_micro_batches_add_up_to_the_batch(dataset: Prepared, tmp_path: Path) ->
     config = replace(SHORT, steps=4)
     for name, batch, accumulate in (("at_once", 2, 1), ("in_turn", 1, 2)):
         encoder = small_encoder()
+        # Orders as in evaluation, and nothing dropped: both are drawn at random once a micro-batch.
+        encoder.train = encoder.eval = lambda mode=True, encoder=encoder: encoder  # type: ignore[method-assign]
         for module in encoder.modules():
+            module.training = False
             if hasattr(module, "share"):
-                module.share = 0.0  # What is dropped at random is drawn by micro-batch.
-        one = encoder_trainer(
-            encoder,
-            samples(*dataset),
-            LOSSES,
-            replace(config, batch=batch, accumulate=accumulate),
-            folder=_made(tmp_path / name),
-            settings={},
-        )
-        _fix_turns(encoder)
-        one.run()
+                module.share = 0.0
+        changed = replace(config, batch=batch, accumulate=accumulate)
+        encoder_trainer(encoder, samples(*dataset), LOSSES, changed, folder=made(tmp_path / name), settings={}).run()
     for column in ("loss", "field", "render", "contrast", "gradient"):
         one, two = (losses(tmp_path / name, column) for name in ("at_once", "in_turn"))
         np.testing.assert_allclose(one, two, rtol=1e-4 if column != "gradient" else 1e-3)
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir()
-    return folder
-
-
-def _fix_turns(encoder: torch.nn.Module) -> None:
-    """Orders as in evaluation: their shuffle is drawn once a micro-batch."""
-    encoder.train = lambda mode=True: encoder  # type: ignore[method-assign,assignment]
-    encoder.eval = lambda: encoder  # type: ignore[method-assign,assignment]
-    for module in encoder.modules():
-        module.training = False
 
 
 def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the_scene(dataset, tmp_path, monkeypatch):
@@ -198,14 +182,8 @@ def whole(dataset: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset, whole, tmp_path):
-    def stop_at_five(steps: range, label: str):
-        for step in steps:
-            if step == 5:
-                raise KeyboardInterrupt
-            yield step
-
     with pytest.raises(KeyboardInterrupt):
-        trainer(dataset, tmp_path / "cut").run(stop_at_five)
+        trainer(dataset, tmp_path / "cut").run(stop_at(5))
     assert len(losses(tmp_path / "cut")) == 5
     again = trainer(dataset, tmp_path / "cut")
     assert again.state.step == 5
@@ -236,14 +214,10 @@ def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, whole: 
 
 @pytest.mark.parametrize(("cause", "saved"), [(Stopped(15), True), (KeyboardInterrupt(), True), (None, False)])
 def test_a_stop_that_compiled_code_wraps_is_a_stop(dataset, tmp_path, cause, saved):
-    def stop_at_three(steps: range, label: str):
-        for step in steps:
-            if step == 3:
-                raise SystemError("returned a result with an exception set") from cause
-            yield step
-
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = cause
     with pytest.raises(SystemError):
-        trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9)).run(stop_at_three)
+        trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9)).run(stop_at(3, error))
     assert (tmp_path / TRAINING_CHECKPOINT_FILE).is_file() == saved
 
 
@@ -347,19 +321,10 @@ if __name__ == "__main__":
 
 
 def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int, before: str = "") -> Path:
-    folder.mkdir(exist_ok=True)
-    path = folder / "run.py"
-    path.write_text(
-        before
-        + SCRIPT.format(
-            tests=str(Path(__file__).resolve().parent.parent),
-            prepared=str(dataset[0].folder),
-            names=dataset[1],
-            steps=steps,
-            accumulate=accumulate,
-            folder=str(folder),
-        )
-    )
+    places = {"tests": str(Path(__file__).resolve().parent.parent), "prepared": str(dataset[0].folder)}
+    numbers = {"names": dataset[1], "steps": steps, "accumulate": accumulate}
+    path = made(folder) / "run.py"
+    path.write_text(before + SCRIPT.format(folder=str(folder), **places, **numbers))
     return path
 
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 from tiny_vlm import PATCH, SIDE
-from tuning_pairs import SHORT, Pairs, losses, made, make_pairs, sample, samples
+from training_scenes import losses, made, rows, stop_at
+from tuning_pairs import SHORT, Pairs, make_pairs, sample, samples
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.tune import (
     IGNORED,
@@ -63,11 +63,6 @@ def tuned(model: Path, pairs: Pairs, tmp_path_factory: pytest.TempPathFactory) -
     return done, folder
 
 
-def rows(folder: Path) -> list[dict[str, str]]:
-    """The log without what the clock says."""
-    return [{name: value for name, value in row.items() if name != "seconds"} for row in read_log(folder / LOG_FILE)]
-
-
 def test_the_loss_on_twenty_pairs_falls_to_a_tenth(model: Path, pairs: Pairs, tmp_path: Path) -> None:
     lora = AdapterConfig(rank=16, alpha=32.0, dropout=0.0)
     train = replace(SHORT.train, steps=30, batch=20, learning_rate=0.01, warmup=5)
@@ -80,15 +75,8 @@ def test_the_loss_on_twenty_pairs_falls_to_a_tenth(model: Path, pairs: Pairs, tm
 def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(model: Path, pairs: Pairs, tmp_path: Path) -> None:
     config = replace(SHORT, lora=replace(SHORT.lora, dropout=0.2))
     tune(*pairs, model, config, work=made(tmp_path / "whole"))
-
-    def stop_at_five(steps: range, label: str) -> Any:
-        for step in steps:
-            if step == 5:
-                raise KeyboardInterrupt
-            yield step
-
     with pytest.raises(KeyboardInterrupt):
-        tune(*pairs, model, config, work=made(tmp_path / "cut"), track=stop_at_five)
+        tune(*pairs, model, config, work=made(tmp_path / "cut"), track=stop_at(5))
     assert len(losses(tmp_path / "cut")) == 5
     tune(*pairs, model, config, work=tmp_path / "cut")
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
@@ -322,11 +310,9 @@ def test_tokens_are_trained_on_and_projected_where_channels_differ(model: Path, 
     again = open_tuned(tmp_path / "out", model, with_tokens=True)
     one = sample(PairSamples(pairs[0], pairs[1], again.processor, longest=None, seed=0))
     with torch.no_grad():
-        torch.testing.assert_close(
-            again.network(one.inputs, one.tokens), done.network(one.inputs, one.tokens), rtol=0, atol=0
-        )
-        other = again.network(one.inputs, None if one.tokens is None else one.tokens + 1)
-        assert not torch.equal(other, again.network(one.inputs, one.tokens))
+        answer, other = again.network(one.inputs, one.tokens), again.network(one.inputs, one.tokens + 1)
+        torch.testing.assert_close(answer, done.network(one.inputs, one.tokens), rtol=0, atol=0)
+        assert not torch.equal(other, answer)
 
 
 def test_prompts_that_are_longer_than_the_model_takes_are_refused(model: Path, pairs: Pairs) -> None:
@@ -415,8 +401,7 @@ def test_layers_are_written_in_order_whatever_the_hashes_of_a_process_are(tmp_pa
     names = {f"layers.{number}.{part}_proj" for number in range(8) for part in "qkvo"}
     settings = SimpleNamespace(target_modules=names)
     written: list[list[str]] = []
-    adapted = SimpleNamespace(
-        peft_config={"default": settings}, save_pretrained=lambda _: written.append([*settings.target_modules])
-    )
+    save = lambda _: written.append([*settings.target_modules])  # noqa: E731
+    adapted = SimpleNamespace(peft_config={"default": settings}, save_pretrained=save)
     save_adapters(tmp_path, adapted, SimpleNamespace(save_pretrained=lambda _: None))
     assert written == [sorted(names)]

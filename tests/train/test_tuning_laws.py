@@ -87,9 +87,6 @@ def test_the_loss_of_a_token_is_that_of_the_position_before_it() -> None:
     assert objective.divisors(joined(made("a", [3, 4], 2))) == {TERM: 1.0}
 
 
-# Pairs
-
-
 PROMPT = StoredPrompt(text="t", pictures=("a.png",), tokens="x", space="s")
 PAIR = TuningPair(name="q", prompt=PROMPT, answers=("yes", "y"))
 
@@ -107,9 +104,6 @@ def test_pairs_need_answers_and_one_space() -> None:
             check_pairs(wrong)
 
 
-# Towers
-
-
 def idefics(kind: str = "idefics3", side: int = 90, patch: int = 14) -> tuple[Any, Any]:
     pictures = SimpleNamespace(max_image_size={"longest_edge": side})
     setattr(pictures, SPLIT, True)
@@ -120,9 +114,8 @@ def idefics(kind: str = "idefics3", side: int = 90, patch: int = 14) -> tuple[An
 def llava(**changes: Any) -> tuple[Any, Any]:
     fields = {"layer": -2, "tower": "clip_vision_model", "crop": True, "height": 42, "width": 42, "edge": 42} | changes
     size = None if fields["edge"] is None else {"shortest_edge": fields["edge"]}
-    pictures = SimpleNamespace(
-        size=size, do_center_crop=fields["crop"], crop_size={"height": fields["height"], "width": fields["width"]}
-    )
+    crop_size = {side: fields[side] for side in ("height", "width")}
+    pictures = SimpleNamespace(size=size, do_center_crop=fields["crop"], crop_size=crop_size)
     tower = SimpleNamespace(model_type=fields["tower"], image_size=42, patch_size=14, hidden_size=5)
     config = SimpleNamespace(model_type="llava", vision_config=tower, vision_feature_layer=fields["layer"])
     return config, SimpleNamespace(image_processor=pictures)

@@ -1,6 +1,5 @@
 """`train`, `encode` and `evaluate weights=`, one after the other, as a user runs them."""
 
-import json
 import os
 import shutil
 import signal
@@ -9,11 +8,10 @@ import sys
 import time
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from command_runs import QUICK, refusal
+from command_runs import QUICK, refusal, results_of
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands.train import TrainCommandConfig
@@ -29,13 +27,8 @@ from gsencoder.train import TrainConfig, train
 pytestmark = pytest.mark.slow
 
 
-def summary_of(folder: Path) -> dict[str, Any]:
-    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return summary
-
-
 def test_training_leaves_weights_words_a_log_and_pictures(rooms: Path, trained: Path) -> None:
-    results = summary_of(trained)["results"]
+    results = results_of(trained)
     assert results["steps"] == 6
     assert 0 <= results["validation"]["names"] <= 1
     encoder, outputs, made_by = load_weights(trained / results["weights"])
@@ -64,7 +57,7 @@ def test_the_python_call_trains_the_same_encoder_as_the_command(rooms: Path, tra
     # What was prepared serves the next run.
     assert [path.stat().st_mtime_ns for path in files] == before
     assert len(files) == 3
-    assert result.scores == summary_of(trained)["results"]["validation"]
+    assert result.scores == results_of(trained)["validation"]
     assert result.tables["labels"].names == load_text_table(rooms / "words.safetensors").names
     by_command, _, _ = load_weights(trained / "encoder.safetensors")
     for name, value in result.encoder.state_dict().items():
@@ -77,7 +70,7 @@ def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trai
     out, boxes = tmp_path / "features", tmp_path / "boxes"
     encode = ["encode", str(rooms / "room_2"), f"weights={trained}", f"out={out}", "seeds.voxel=0.06", "quiet=true"]
     assert cli.main(encode) == 0
-    results = summary_of(out)["results"]
+    results = results_of(out)
     scene = load_features(out)
     assert results["gaussians"] == results["seen"] == len(scene.gaussians)
     word = min(thing.name for thing in load_scene(rooms / "room_2").objects if thing.name)
@@ -98,12 +91,12 @@ def test_an_encoder_is_judged_by_either_protocol(rooms: Path, trained: Path, tmp
     for protocol, extra in (("naming", ()), ("localization", ("min_views=1", "min_pixels=1"))):
         words = [f"protocol={protocol}", f"weights={trained}", f"out={tmp_path / protocol}", *extra]
         assert cli.main([*common, *words]) == 0
-    naming = summary_of(tmp_path / "naming")["results"]
+    naming = results_of(tmp_path / "naming")
     assert 0 <= naming["accuracy"] <= 1
     assert "other" in naming["names"]
     # The teacher's own features name themselves.
     assert cli.main([*common, "protocol=naming", f"out={tmp_path / 'self'}"]) == 0
-    assert summary_of(tmp_path / "self")["results"]["accuracy"] == 1
+    assert results_of(tmp_path / "self")["accuracy"] == 1
 
 
 def test_the_names_of_other_rooms_are_absent(rooms: Path, trained: Path, tmp_path: Path) -> None:
@@ -112,10 +105,10 @@ def test_the_names_of_other_rooms_are_absent(rooms: Path, trained: Path, tmp_pat
     words += ["seeds.voxel=0.06", "quiet=true"]
     for name, weights in (("fused", ()), ("encoded", (f"weights={trained}",))):
         assert cli.main(["evaluate", *scenes, "protocol=absent", *words, *weights, f"out={tmp_path / name}"]) == 0
-        results = summary_of(tmp_path / name)["results"]
+        results = results_of(tmp_path / name)
         rows = (tmp_path / name / "words.csv").read_text().splitlines()
         assert len(rows) == 1 + results["present"] + results["absent"]
-    results = summary_of(tmp_path / "fused")["results"]
+    results = results_of(tmp_path / "fused")
     assert results["absent"] > 0
     assert results["auroc"] == 1
     assert results["boxed_absent"] == 0
@@ -123,7 +116,7 @@ def test_the_names_of_other_rooms_are_absent(rooms: Path, trained: Path, tmp_pat
     elsewhere = next(name for name, row in results["names"].items() if row["absent"])
     arguments = ["evaluate", *scenes, "protocol=absent", *words, f"protocol.vocabulary={elsewhere}"]
     assert cli.main([*arguments, f"out={tmp_path / 'one'}"]) == 0
-    assert summary_of(tmp_path / "one")["results"]["absent"] == results["names"][elsewhere]["absent"]
+    assert results_of(tmp_path / "one")["absent"] == results["names"][elsewhere]["absent"]
 
 
 def test_preparing_alone_trains_nothing(rooms: Path, tmp_path: Path) -> None:
@@ -147,7 +140,7 @@ def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(roo
     encoder, outputs, _ = load_weights(out / "encoder.safetensors")
     assert sum(value.numel() for value in encoder.parameters()) > 40e6
     assert outputs["radio"].space.teacher == "radio"
-    assert summary_of(out)["results"]["steps"] == 2
+    assert results_of(out)["steps"] == 2
 
 
 def test_a_sweep_trains_once_for_each_value(rooms: Path, tmp_path: Path) -> None:
@@ -156,7 +149,7 @@ def test_a_sweep_trains_once_for_each_value(rooms: Path, tmp_path: Path) -> None
     arguments = ["train", "-m", str(rooms / "room_0"), words, *places]
     quick = [word for word in QUICK if not word.startswith("train.steps")]
     assert cli.main([*arguments, *quick, "tensorboard=false", "train.steps=1,2"]) == 0
-    assert [summary_of(tmp_path / "out" / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
+    assert [results_of(tmp_path / "out" / str(run))["steps"] for run in range(2)] == [1, 2]
 
 
 @pytest.mark.alone
@@ -169,7 +162,7 @@ def test_the_submitit_launcher_runs_a_sweep_as_jobs(rooms: Path, tmp_path: Path)
     # In a process of its own: the launcher sets signal handlers and environment variables for good.
     command = [sys.executable, "-W", "ignore", "-m", "gsencoder", *arguments, *quick, *launcher, "train.steps=1,2"]
     subprocess.run(command, check=True, timeout=500)
-    assert [summary_of(out / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
+    assert [results_of(out / str(run))["steps"] for run in range(2)] == [1, 2]
 
 
 @pytest.mark.alone
