@@ -25,15 +25,8 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 QUICK = (
-    "quiet=true",
-    "train.steps=6",
-    "train.warmup=2",
-    "train.log_every=2",
-    "sampling.gaussians=600",
-    "sampling.smallest=200",
-    "model.transformer.encoder_depths=[1,1]",
-    "model.transformer.encoder_channels=[32,32]",
-    "model.transformer.decoder_depths=[1]",
-    "model.transformer.decoder_channels=[32]",
-    "seeds.voxel=0.06",
-)
+    "quiet=true", "train.steps=6", "train.warmup=2", "train.log_every=2", "sampling.gaussians=600",
+    "sampling.smallest=200", "model.transformer.encoder_depths=[1,1]",
+    "model.transformer.encoder_channels=[32,32]", "model.transformer.decoder_depths=[1]",
+    "model.transformer.decoder_channels=[32]", "seeds.voxel=0.06",
+)  # fmt: skip

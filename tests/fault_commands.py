@@ -6,22 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 TRAIN = (
-    "train.steps=3",
-    "train.warmup=1",
-    "train.log_every=1",
-    "train.checkpoint_every=0",
-    "train.validate_every=0",
-    "sampling.gaussians=600",
-    "sampling.smallest=200",
-    "model.voxel=0.2",
-    "model.transformer.encoder_depths=[1,1]",
-    "model.transformer.encoder_channels=[16,16]",
-    "model.transformer.decoder_depths=[1]",
-    "model.transformer.decoder_channels=[16]",
-    "model.transformer.head_channels=16",
-    "model.transformer.patch=32",
-    "seeds.voxel=0.1",
-)
+    "train.steps=3", "train.warmup=1", "train.log_every=1", "train.checkpoint_every=0",
+    "train.validate_every=0", "sampling.gaussians=600", "sampling.smallest=200", "model.voxel=0.2",
+    "model.transformer.encoder_depths=[1,1]", "model.transformer.encoder_channels=[16,16]",
+    "model.transformer.decoder_depths=[1]", "model.transformer.decoder_channels=[16]",
+    "model.transformer.head_channels=16", "model.transformer.patch=32", "seeds.voxel=0.1",
+)  # fmt: skip
 VIEWS = ("choose.source=frames", "choose.candidates=4", "choose.count=2")
 QUESTION = "Where is the cube?"
 ROOMS = ("room_a", "room_b")
@@ -252,15 +242,9 @@ def _bad_splat(given: Path) -> None:
 
 
 INPUTS: dict[str, Callable[[Path], None]] = {
-    "room": _room,
-    "features": _features,
-    "trained": _trained,
-    "remembered": _remembered,
-    "named": _named,
-    "model": _model,
-    "asked": _asked,
-    "bad.ply": _bad_splat,
-}
+    "room": _room, "features": _features, "trained": _trained, "remembered": _remembered, "named": _named,
+    "model": _model, "asked": _asked, "bad.ply": _bad_splat,
+}  # fmt: skip
 NEEDED = {"encode": ("trained",), "export": ("trained",), "export of a memory": ("remembered",), "score": ("named",)}
 NEEDED |= {"tune": ("model",), "ask of a set": ("asked",), "repair": ("bad.ply",)}
 

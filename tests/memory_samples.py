@@ -15,15 +15,10 @@ def make_bank(components: np.ndarray, mean: np.ndarray, space: FeatureSpace, cos
     """A bank whose components lie in the first cell of the first view."""
     count = len(components)
     return MemoryBank(
-        components=components.astype(np.float32),
-        sources=np.zeros((count, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (count, 1, 1)),
-        mean=mean,
-        threshold=0.9,
-        coverage=1.0,
-        cosine=cosine,
-        space=space,
-    )
+        components=components.astype(np.float32), sources=np.zeros((count, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (count, 1, 1)), mean=mean, threshold=0.9, coverage=1.0,
+        cosine=cosine, space=space,
+    )  # fmt: skip
 
 
 def make_memory(
@@ -60,15 +55,9 @@ def memory_of_features(
     """The memory of features without any training."""
     queries, projection = principal_queries(features, bank, channels, scoring)
     return QueryMemory(
-        queries=queries,
-        weights=features.weights,
-        projection=projection,
-        bank=bank,
-        scoring=scoring,
-        temperature=temperature,
-        mean=features.mean,
-        basis=features.basis,
-    )
+        queries=queries, weights=features.weights, projection=projection, bank=bank, scoring=scoring,
+        temperature=temperature, mean=features.mean, basis=features.basis,
+    )  # fmt: skip
 
 
 def render_features(memory: QueryMemory, b: Blend) -> tuple[np.ndarray, np.ndarray]:

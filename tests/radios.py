@@ -5,15 +5,9 @@ from pathlib import Path
 from typing import Any
 
 SMALL = {
-    "hidden_size": 24,
-    "num_hidden_layers": 2,
-    "num_attention_heads": 2,
-    "patch_size": 8,
-    "image_size": 32,
-    "max_img_size": 64,
-    "num_cls_tokens": 2,
-    "num_registers": 3,
-}
+    "hidden_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2, "patch_size": 8, "image_size": 32,
+    "max_img_size": 64, "num_cls_tokens": 2, "num_registers": 3,
+}  # fmt: skip
 TEACHERS = [
     {"type": "open_clip", "name": "siglip", "model": "ViT-SO400M-14-SigLIP-384"},
     {"type": "sam", "name": "sam", "model": "vit-h"},

@@ -101,9 +101,6 @@ def write_scannet_frames(scene: Scene, folder: Path) -> None:
 
 
 WRITERS: dict[str, Callable[[Scene, Path], None]] = {
-    "7-Scenes": write_seven_scenes,
-    "TUM RGB-D": write_tum,
-    "Replica": write_replica,
-    "ScanNet++": write_scannetpp,
-    "ScanNet": write_scannet_frames,
-}
+    "7-Scenes": write_seven_scenes, "TUM RGB-D": write_tum, "Replica": write_replica,
+    "ScanNet++": write_scannetpp, "ScanNet": write_scannet_frames,
+}  # fmt: skip

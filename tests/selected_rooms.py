@@ -68,14 +68,9 @@ def selected_room(*, under: bool = True) -> tuple[Scene, np.ndarray]:
     cameras = circling()
     views = Views(cameras=cameras, names=tuple(f"frame {number:02d}" for number in range(len(cameras))))
     scene = Scene(
-        name="table",
-        gaussians=splat_of(means),
-        views=views,
-        features={"names": features},
-        origin=np.array([1000.0, -20.0, 3.0]),
-        up=UP,
-        metres_per_unit=1.0,
-    )
+        name="table", gaussians=splat_of(means), views=views, features={"names": features},
+        origin=np.array([1000.0, -20.0, 3.0]), up=UP, metres_per_unit=1.0,
+    )  # fmt: skip
     return scene, kinds
 
 

@@ -44,13 +44,9 @@ def make_raw(count: int = 300, degree: int = 1, seed: int = 0) -> RawSplat:
     gaussians = make_gaussians(count, degree, seed)
     rng = np.random.default_rng(seed + 1)
     return RawSplat(
-        means=gaussians.means.astype(np.float64),
-        quats=gaussians.quats,
-        log_scales=np.log(gaussians.scales),
-        logit_opacities=rng.normal(0, 2, count).astype(np.float32),
-        sh=gaussians.sh,
-        format="made for a test",
-    )
+        means=gaussians.means.astype(np.float64), quats=gaussians.quats, log_scales=np.log(gaussians.scales),
+        logit_opacities=rng.normal(0, 2, count).astype(np.float32), sh=gaussians.sh, format="made for a test",
+    )  # fmt: skip
 
 
 def same_sign(quats: np.ndarray, like: np.ndarray) -> np.ndarray:

@@ -14,52 +14,24 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "gsencoder"
 
 LEVELS = (
-    ("core",),
-    ("types",),
-    ("geometry",),
-    ("text", "data", "render"),
-    ("models", "teachers"),
-    ("fusion", "reconstruct"),
-    ("memory",),
-    ("train", "infer"),
-    ("evaluate",),
-    ("app",),
-    ("__main__",),
-)
+    ("core",), ("types",), ("geometry",), ("text", "data", "render"), ("models", "teachers"),
+    ("fusion", "reconstruct"), ("memory",), ("train", "infer"), ("evaluate",), ("app",), ("__main__",),
+)  # fmt: skip
 """Lowest first. A part may import lower levels and itself; parts of one level do not know each other."""
 
 RANK = {name: rank for rank, names in enumerate(LEVELS) for name in names}
 
 TORCH_FREE = [
-    "gsencoder",
-    "gsencoder.types",
-    "gsencoder.core.errors",
-    "gsencoder.data.splats.files",
-    "gsencoder.data.splats.repair",
-    "gsencoder.text.table",
-    "gsencoder.core.archive",
-    "gsencoder.fusion.basis",
-    "gsencoder.fusion.checkpoint",
-    "gsencoder.fusion.folder",
-    "gsencoder.memory.reduction",
-    "gsencoder.models.grid",
-    "gsencoder.infer.encode",
-    "gsencoder.infer.onnx.runtime",
-    "gsencoder.app.commands.encode",
-    "gsencoder.app.commands.localize",
-    "gsencoder.app.commands.view",
-    "gsencoder.evaluate.benchmarks.answers",
-    "gsencoder.evaluate.benchmarks.captions",
-    "gsencoder.infer.localize",
-    "gsencoder.infer.draw",
-    "gsencoder.infer.page.report",
-    "gsencoder.app.output",
-    "gsencoder.app.options",
-    "gsencoder.app.compose",
-    "gsencoder.app.commands.inspect",
-    "gsencoder.app.commands.repair",
-    "gsencoder.app.main",
-]
+    "gsencoder", "gsencoder.types", "gsencoder.core.errors", "gsencoder.data.splats.files",
+    "gsencoder.data.splats.repair", "gsencoder.text.table", "gsencoder.core.archive", "gsencoder.fusion.basis",
+    "gsencoder.fusion.checkpoint", "gsencoder.fusion.folder", "gsencoder.memory.reduction",
+    "gsencoder.models.grid", "gsencoder.infer.encode", "gsencoder.infer.onnx.runtime",
+    "gsencoder.app.commands.encode", "gsencoder.app.commands.localize", "gsencoder.app.commands.view",
+    "gsencoder.evaluate.benchmarks.answers", "gsencoder.evaluate.benchmarks.captions",
+    "gsencoder.infer.localize", "gsencoder.infer.draw", "gsencoder.infer.page.report", "gsencoder.app.output",
+    "gsencoder.app.options", "gsencoder.app.compose", "gsencoder.app.commands.inspect",
+    "gsencoder.app.commands.repair", "gsencoder.app.main",
+]  # fmt: skip
 
 
 def part_of(path: Path, package: Path = PACKAGE) -> str:

@@ -17,17 +17,10 @@ from gsencoder.models.encoder import load_weights
 pytestmark = pytest.mark.slow
 
 QUICK = (
-    "quiet=true",
-    "tensorboard=false",
-    "train.steps=4",
-    "train.warmup=2",
-    "train.log_every=2",
-    "sampling.gaussians=500",
-    "sampling.smallest=200",
-    "seeds.voxel=0.06",
-    "model.transformer.encoder_channels=[32,32,32,32,32]",
-    "model.transformer.decoder_channels=[32,32,32,32]",
-)
+    "quiet=true", "tensorboard=false", "train.steps=4", "train.warmup=2", "train.log_every=2",
+    "sampling.gaussians=500", "sampling.smallest=200", "seeds.voxel=0.06",
+    "model.transformer.encoder_channels=[32,32,32,32,32]", "model.transformer.decoder_channels=[32,32,32,32]",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -98,13 +91,9 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named
     (only,) = load_features(tmp_path / "one").features.values()
     np.testing.assert_array_equal(only.features, scene.features["palette"].features)
     arguments = [
-        "localize",
-        str(tmp_path / "one"),
-        "query=red",
-        "space=palette",
-        "localize.min_probability=0",
+        "localize", str(tmp_path / "one"), "query=red", "space=palette", "localize.min_probability=0",
         "quiet=true",
-    ]
+    ]  # fmt: skip
     assert cli.main([*arguments, "pictures=0", f"out={tmp_path / 'red'}"]) == 0
     assert {path.name for path in (tmp_path / "one").iterdir()} >= {"features.safetensors", "words.safetensors"}
     assert "got 'depth'" in refusal(capsys, *words[:3], "spaces=[depth,labels]", f"out={tmp_path / 'none'}")

@@ -28,13 +28,9 @@ SMALL_MODEL = (
     "model.transformer.patch=64",
 )
 QUICK = (
-    "quiet=true",
-    "tensorboard=false",
-    "train.warmup=2",
-    "train.log_every=1",
-    "sampling.views=1",
+    "quiet=true", "tensorboard=false", "train.warmup=2", "train.log_every=1", "sampling.views=1",
     "seeds.voxel=0.08",
-)
+)  # fmt: skip
 
 
 def composed(*words: str) -> TrainCommandConfig:

@@ -115,13 +115,9 @@ def test_a_map_is_in_one_form_and_knows_its_size():
     ]
     assert [(each.height, each.width) for each in maps] == [(3, 4)] * 3
     forms: list[dict[str, Any]] = [
-        {},
-        {"table": TABLE},
-        {"features": features, "table": TABLE},
-        {"features": features, "shares": shares},
-        {"codes": codes},
-        {"codes": codes, "shares": shares, "table": TABLE},
-    ]
+        {}, {"table": TABLE}, {"features": features, "table": TABLE}, {"features": features, "shares": shares},
+        {"codes": codes}, {"codes": codes, "shares": shares, "table": TABLE},
+    ]  # fmt: skip
     for form in forms:
         with pytest.raises(InputError, match="expected features, or codes or shares with their table"):
             FeatureMap(**form, **GRID)

@@ -90,12 +90,8 @@ def write_box(folder: Path, views: Views, *, millimeters: float = 1000.0) -> dic
         )
     K = views.cameras.Ks[0].astype(float)
     content = {
-        "fl_x": K[0, 0],
-        "fl_y": K[1, 1],
-        "cx": K[0, 2],
-        "cy": K[1, 2],
-        "depth_unit_scale_factor": 1 / millimeters,
-        "frames": frames,
-    }
+        "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2],
+        "depth_unit_scale_factor": 1 / millimeters, "frames": frames,
+    }  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
     return content

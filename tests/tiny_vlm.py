@@ -66,19 +66,12 @@ def save_tiny_vlm(folder: Path, spread: float = 1.0) -> None:
             "patch_size": PATCH,
         },
         text_config={
-            "model_type": "llama",
-            "hidden_size": 64,
-            "intermediate_size": 128,
-            "num_hidden_layers": 2,
-            "num_attention_heads": 4,
-            "num_key_value_heads": 2,
-            "vocab_size": len(words),
-            "pad_token_id": words.pad_token_id,
-            "bos_token_id": words.bos_token_id,
-            "eos_token_id": words.eos_token_id,
-            "max_position_embeddings": 4096,
+            "model_type": "llama", "hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 2,
+            "num_attention_heads": 4, "num_key_value_heads": 2, "vocab_size": len(words),
+            "pad_token_id": words.pad_token_id, "bos_token_id": words.bos_token_id,
+            "eos_token_id": words.eos_token_id, "max_position_embeddings": 4096,
         },
-    )
+    )  # fmt: skip
     model = Idefics3ForConditionalGeneration(config).eval()
     with torch.no_grad():
         model.lm_head.weight *= spread

@@ -27,15 +27,10 @@ SPACE = FeatureSpace(name="sides", channels=4)
 SMALL = EncoderConfig(
     voxel=0.1,
     transformer=TransformerConfig(
-        encoder_depths=(1, 1),
-        encoder_channels=(16, 32),
-        decoder_depths=(1,),
-        decoder_channels=(16,),
-        head_channels=16,
-        patch=32,
-        drop_path=0.2,
+        encoder_depths=(1, 1), encoder_channels=(16, 32), decoder_depths=(1,), decoder_channels=(16,),
+        head_channels=16, patch=32, drop_path=0.2,
     ),
-)
+)  # fmt: skip
 LOSSES = LossConfig(contrast_weight=0.3)
 """All terms at once."""
 PREPARE = PrepareConfig(fusion=FuseConfig(basis=False), render_cell=4, render_min_weight=0.0)

@@ -63,14 +63,9 @@ def dinov3() -> Any:
 
 def sam() -> Any:
     vision = {
-        **SHAPE,
-        "image_size": SIDE,
-        "patch_size": PATCH,
-        "window_size": 3,
-        "global_attn_indexes": [1],
-        "output_channels": SAM_CHANNELS,
-        "mlp_dim": 24,
-    }
+        **SHAPE, "image_size": SIDE, "patch_size": PATCH, "window_size": 3, "global_attn_indexes": [1],
+        "output_channels": SAM_CHANNELS, "mlp_dim": 24,
+    }  # fmt: skip
     prompts = {"hidden_size": 16, "image_size": SIDE, "patch_size": PATCH, "image_embedding_size": SIDE // PATCH}
     return transformers.SamModel(
         transformers.SamConfig(
@@ -121,20 +116,10 @@ def smolvlm() -> Any:
 MAKERS: Mapping[str, Callable[[], Any]] = {
     make.__name__: make
     for make in (
-        clip,
-        siglip,
-        siglip2,
-        dinov2,
-        dinov2_with_registers,
-        dinov3,
-        sam,
-        llava,
-        paligemma,
-        gemma3,
-        idefics3,
+        clip, siglip, siglip2, dinov2, dinov2_with_registers, dinov3, sam, llava, paligemma, gemma3, idefics3,
         smolvlm,
     )
-}
+}  # fmt: skip
 
 
 def processor_of(kind: str) -> Any:
@@ -161,16 +146,10 @@ def save_preprocessing(kind: str, folder: Path) -> None:
         processor_of(kind).save_pretrained(folder)
         return
     stated = {
-        "image_processor_type": "DINOv3ViTImageProcessorFast",
-        "do_normalize": True,
-        "do_rescale": True,
-        "do_resize": True,
-        "image_mean": [0.485, 0.456, 0.406],
-        "image_std": [0.229, 0.224, 0.225],
-        "resample": 2,
-        "rescale_factor": 0.00392156862745098,
-        "size": {"height": SIDE, "width": SIDE},
-    }
+        "image_processor_type": "DINOv3ViTImageProcessorFast", "do_normalize": True, "do_rescale": True,
+        "do_resize": True, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225],
+        "resample": 2, "rescale_factor": 0.00392156862745098, "size": {"height": SIDE, "width": SIDE},
+    }  # fmt: skip
     (folder / "preprocessor_config.json").write_text(json.dumps(stated))
 
 

@@ -66,14 +66,9 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
     assert isinstance(data, dict)
     assert data.pop("data")["max_views"] == 0
     assert data == {
-        "out": "null",
-        "overwrite": False,
-        "quiet": False,
-        "preset": "balanced",
-        "paths": ["a b.ply"],
-        "fix": ["quats", "huge"],
-        "views": 0,
-    }
+        "out": "null", "overwrite": False, "quiet": False, "preset": "balanced", "paths": ["a b.ply"],
+        "fix": ["quats", "huge"], "views": 0,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

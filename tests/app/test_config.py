@@ -13,13 +13,7 @@ from hypothesis import strategies as st
 from gsencoder.app import main as cli
 from gsencoder.app.compose import compose, from_dict, join_list, split_list
 from gsencoder.app.main import COMMANDS, check_required
-from gsencoder.app.options import (
-    HIDDEN,
-    CommonConfig,
-    options_of,
-    settings,
-    union_members,
-)
+from gsencoder.app.options import HIDDEN, CommonConfig, options_of, settings, union_members
 from gsencoder.core.errors import InputError
 
 
@@ -230,28 +224,10 @@ def test_a_number_that_is_not_finite_is_refused_by_name(name: str) -> None:
 
 
 HOSTILE = [
-    "mug,banana",
-    "What's red?",
-    "日本語 🥄",
-    "1e-3",
-    "null",
-    "  x ",
-    "${oc.env:HOME}",
-    "${",
-    "",
-    "a\r\nb",
-    '\\"',
-    "[a,b]",
-    "~x",
-    "???",
-    "choice(a,b)",
-    "a#b",
-    "%s %(x)s {0}",
-    "${text:x41}",
-    "\u2028",
-    "\x7f\x1b[31m",
+    "mug,banana", "What's red?", "日本語 🥄", "1e-3", "null", "  x ", "${oc.env:HOME}", "${", "", "a\r\nb", '\\"',
+    "[a,b]", "~x", "???", "choice(a,b)", "a#b", "%s %(x)s {0}", "${text:x41}", "\u2028", "\x7f\x1b[31m",
     "\udcff",
-]
+]  # fmt: skip
 
 
 def test_text_arrives_as_it_was_typed(conf: Path) -> None:

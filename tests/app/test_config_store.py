@@ -226,12 +226,9 @@ def test_choices_come_from_unions_presets_and_experiments_wherever_their_section
         "experiment": ("long", "none"),
     }
     assert choices.chosen == {
-        "student/network": "tiny",
-        "student/damage": "noise",
-        "teacher": "blur",
-        "preset": "balanced",
+        "student/network": "tiny", "student/damage": "noise", "teacher": "blur", "preset": "balanced",
         "experiment": "none",
-    }
+    }  # fmt: skip
     assert toy(conf) == ToyConfig()
     assert toy(conf, "network=large", "damage=blur", "student.damage.radius=3", "teacher=wide") == ToyConfig(
         student=StudentConfig(network=NetworkConfig(width=64), damage=BlurConfig(radius=3)),

@@ -25,24 +25,15 @@ class Thing:
 
 def test_numpy_values_paths_and_dataclasses_are_written_as_json(tmp_path: Path) -> None:
     value = {
-        "array": np.arange(6, dtype=np.float32).reshape(2, 3),
-        "int": np.int64(3),
-        "bool": np.bool_(True),
-        "half": np.float16(0.5),
-        "thing": Thing(path=Path("a/b"), size=np.float32(0.5)),
-        "tuple": (1, None, os.fsdecode(b"a\xff")),
-        3: [],
-    }
+        "array": np.arange(6, dtype=np.float32).reshape(2, 3), "int": np.int64(3), "bool": np.bool_(True),
+        "half": np.float16(0.5), "thing": Thing(path=Path("a/b"), size=np.float32(0.5)),
+        "tuple": (1, None, os.fsdecode(b"a\xff")), 3: [],
+    }  # fmt: skip
     write_json(tmp_path / "a.json", value)
     assert json.loads((tmp_path / "a.json").read_text()) == {
-        "array": [[0, 1, 2], [3, 4, 5]],
-        "int": 3,
-        "bool": True,
-        "half": 0.5,
-        "thing": {"path": "a/b", "size": 0.5},
-        "tuple": [1, None, "a\udcff"],
-        "3": [],
-    }
+        "array": [[0, 1, 2], [3, 4, 5]], "int": 3, "bool": True, "half": 0.5,
+        "thing": {"path": "a/b", "size": 0.5}, "tuple": [1, None, "a\udcff"], "3": [],
+    }  # fmt: skip
 
 
 def test_numbers_that_are_not_finite_become_null_and_are_named(tmp_path: Path) -> None:

@@ -36,12 +36,9 @@ def scene_of(*rows: tuple[str, bool, float]) -> tuple[WordPresence, ...]:
 
 def test_words_hardly_seen_are_neither_present_nor_absent() -> None:
     objects = [
-        thing("mug"),
-        thing("sofa", placed=False),
-        thing("fork", views=4),
-        thing("pen", max_pixels=59),
+        thing("mug"), thing("sofa", placed=False), thing("fork", views=4), thing("pen", max_pixels=59),
         thing(None),
-    ]
+    ]  # fmt: skip
     house = ["mug", "sofa", "fork", "pen", "lamp", "drill"]
     assert words_to_ask(objects, house) == (["mug", "sofa"], ["drill", "lamp"])
     # A word is present if any object of its name is seen well.

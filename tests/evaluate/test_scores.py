@@ -25,17 +25,10 @@ ONES = np.ones(3)
 
 def box(query: str, rank: int, low: float, high: float) -> Box:
     return Box(
-        query=query,
-        rank=rank,
-        score=1.0 - 0.1 * rank,
-        probability=1.0,
-        aabb_min=ONES * low,
-        aabb_max=ONES * high,
-        obb_center=ONES * (low + high) / 2,
-        obb_rotation=np.eye(3),
-        obb_size=ONES * (high - low),
-        rows=np.arange(1),
-    )
+        query=query, rank=rank, score=1.0 - 0.1 * rank, probability=1.0, aabb_min=ONES * low,
+        aabb_max=ONES * high, obb_center=ONES * (low + high) / 2, obb_rotation=np.eye(3),
+        obb_size=ONES * (high - low), rows=np.arange(1),
+    )  # fmt: skip
 
 
 def thing(number: int, name: str | None, low: float, high: float, **facts: int | bool) -> SceneObject:
@@ -44,12 +37,9 @@ def thing(number: int, name: str | None, low: float, high: float, **facts: int |
 
 def field(features: np.ndarray, weights: np.ndarray, basis: FeatureBasis | None = None) -> GaussianFeatures:
     return GaussianFeatures(
-        features=features.astype(np.float32),
-        weights=weights.astype(np.float32),
-        mean=np.array([1.0, 0, 0, 0], np.float32),
-        space=SPACE,
-        basis=basis,
-    )
+        features=features.astype(np.float32), weights=weights.astype(np.float32),
+        mean=np.array([1.0, 0, 0, 0], np.float32), space=SPACE, basis=basis,
+    )  # fmt: skip
 
 
 def test_iou_of_boxes_that_touch_overlap_and_coincide() -> None:

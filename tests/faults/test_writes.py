@@ -14,13 +14,9 @@ from fault_pairs import Pairs
 from fault_runs import CUT, DENY, FULL, IO_ERROR, KILL, READ_ERROR, SHORT, SHORT_FULL, TEAR, VANISH
 
 FAULTS = {
-    "train": (KILL, TEAR),
-    "reconstruct": (KILL, IO_ERROR),
-    "pack as npz": (TEAR, FULL),
-    "score": (KILL, SHORT),
-    "questions": (FULL, SHORT_FULL),
-    "repair": (KILL, FULL),
-}
+    "train": (KILL, TEAR), "reconstruct": (KILL, IO_ERROR), "pack as npz": (TEAR, FULL), "score": (KILL, SHORT),
+    "questions": (FULL, SHORT_FULL), "repair": (KILL, FULL),
+}  # fmt: skip
 """Of each way in which commands write: folders of state that a run continues from, logs, folders, single files."""
 LOST_INPUTS = {"pack as npz": (DENY, VANISH), "score": (CUT, READ_ERROR), "questions": (VANISH, CUT)}
 Checkers = Callable[[str], Checker]

@@ -86,15 +86,10 @@ def output_space_error(case: Case) -> float:
 def bank_of(case: Case) -> MemoryBank:
     m = min(40, len(case.vectors))
     return MemoryBank(
-        components=case.vectors[:m],
-        sources=np.zeros((m, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (m, 1, 1)),
-        mean=np.zeros(CHANNELS, np.float32),
-        threshold=0.9,
-        coverage=1.0,
-        cosine=0.95,
-        space=SPACE,
-    )
+        components=case.vectors[:m], sources=np.zeros((m, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (m, 1, 1)), mean=np.zeros(CHANNELS, np.float32), threshold=0.9,
+        coverage=1.0, cosine=0.95, space=SPACE,
+    )  # fmt: skip
 
 
 @routine("memory attention, products", "vectors", "logits")
@@ -124,14 +119,9 @@ def cosine_attention_error(case: Case) -> float:
         with torch.no_grad():
             got = network(torch.from_numpy(queries))
         memory = QueryMemory(
-            queries=queries,
-            weights=np.ones(50, np.float32),
-            projection=projection,
-            bank=bank,
-            scoring="centered",
-            temperature=0.05,
-            mean=mean,
-        )
+            queries=queries, weights=np.ones(50, np.float32), projection=projection, bank=bank,
+            scoring="centered", temperature=0.05, mean=mean,
+        )  # fmt: skip
         # What float32 rounds of components close to their mean is part of the case.
         keys = (bank.components - mean).astype(Wide)
         keys = keys / np.where(lengths(keys) > 0, lengths(keys), 1)

@@ -27,15 +27,11 @@ from gsencoder.types import SH_C0
 Wide = oracles.Wide
 CONFIG = EncoderConfig(
     transformer=TransformerConfig(
-        encoder_depths=(1, 1),
-        encoder_channels=(16, 32),
-        decoder_depths=(1,),
-        decoder_channels=(16,),
-        head_channels=8,
-        patch=24,
+        encoder_depths=(1, 1), encoder_channels=(16, 32), decoder_depths=(1,), decoder_channels=(16,),
+        head_channels=8, patch=24,
     ),
     projector=16,
-)
+)  # fmt: skip
 FEW = 250
 """Gaussians of a case that the encoder and exact arithmetic are measured on."""
 

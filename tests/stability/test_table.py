@@ -64,13 +64,9 @@ def test_an_error_that_is_not_finite_is_infinite() -> None:
 
 EXAMPLES = int(os.environ.get("GSENCODER_STABILITY_EXAMPLES", "3"))
 SEARCH = settings(
-    max_examples=EXAMPLES,
-    deadline=None,
-    derandomize=EXAMPLES < 100,
-    database=None,
-    phases=(Phase.generate, Phase.target, Phase.shrink),
-    suppress_health_check=list(HealthCheck),
-)
+    max_examples=EXAMPLES, deadline=None, derandomize=EXAMPLES < 100, database=None,
+    phases=(Phase.generate, Phase.target, Phase.shrink), suppress_health_check=list(HealthCheck),
+)  # fmt: skip
 
 
 def recipes(routine: Routine) -> st.SearchStrategy[Recipe]:

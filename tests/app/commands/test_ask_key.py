@@ -18,13 +18,8 @@ pytest.importorskip("openai")
 
 KEY = "sk-never+to/be&written=0123456789"
 SPELLINGS = {
-    KEY,
-    quote(KEY, safe=""),
-    quote(KEY),
-    html.escape(KEY),
-    json.dumps(KEY)[1:-1].replace("/", "\\/"),
-    KEY[:20],
-}
+    KEY, quote(KEY, safe=""), quote(KEY), html.escape(KEY), json.dumps(KEY)[1:-1].replace("/", "\\/"), KEY[:20],
+}  # fmt: skip
 ESCAPE = "\x1b[31m"
 
 

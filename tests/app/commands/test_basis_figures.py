@@ -20,18 +20,11 @@ from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
 pytestmark = pytest.mark.slow
 
 TRAIN = (
-    "teacher=palette",
-    "prepare.fusion.max_rank=3",
-    "holdout=room_1",
-    "model.transformer.encoder_depths=[1]",
-    "model.transformer.encoder_channels=[32]",
-    "model.transformer.decoder_depths=[]",
-    "model.transformer.decoder_channels=[]",
-    "train.steps=2",
-    "train.warmup=1",
-    "sampling.gaussians=500",
+    "teacher=palette", "prepare.fusion.max_rank=3", "holdout=room_1", "model.transformer.encoder_depths=[1]",
+    "model.transformer.encoder_channels=[32]", "model.transformer.decoder_depths=[]",
+    "model.transformer.decoder_channels=[]", "train.steps=2", "train.warmup=1", "sampling.gaussians=500",
     "tensorboard=false",
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -119,12 +119,8 @@ def test_repair_writes_a_scene_without_the_fault_that_inspect_names(box, arc, tm
     assert cli.main(["inspect", str(repaired), outside]) == 0
     assert "nothing wrong was seen" in said(capsys)
     assert sorted(path.name for path in scene.iterdir()) == [
-        "depth",
-        "images",
-        "repaired.json",
-        "repaired.json.summary.json",
-        "transforms.json",
-    ]
+        "depth", "images", "repaired.json", "repaired.json.summary.json", "transforms.json",
+    ]  # fmt: skip
 
 
 def test_repair_of_a_scene_without_faults_writes_nothing(box, tmp_path, capsys):

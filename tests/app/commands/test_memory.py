@@ -60,14 +60,9 @@ def test_a_memory_of_two_teachers_is_written_with_its_words_and_figures(made: Pa
     pictures = {"attention.{}.view000.png", "attention.{}.view002.png", "components.{}.png"}
     drawn = {name.format(teacher) for name in pictures for teacher in ("labels", "palette")}
     assert {path.name for path in made.iterdir()} - drawn == {
-        "log.csv",
-        "memory.labels.safetensors",
-        "memory.palette.safetensors",
-        "scene.safetensors",
-        "summary.json",
-        "words.labels.safetensors",
-        "words.palette.safetensors",
-    }
+        "log.csv", "memory.labels.safetensors", "memory.palette.safetensors", "scene.safetensors",
+        "summary.json", "words.labels.safetensors", "words.palette.safetensors",
+    }  # fmt: skip
     for name in drawn:
         with Image.open(made / name) as picture:
             picture.load()

@@ -108,15 +108,11 @@ def test_evaluate_scores_a_scan_on_its_vertices_and_takes_boxes_and_kinds_of_sen
     placed = [thing for thing in room.objects if thing.placed and thing.name]
     sentences = [
         {
-            "scene_id": "scene0000_00",
-            "object_id": str(thing.id - 1),
-            "object_name": str(thing.name),
-            "ann_id": "0",
-            "description": f"the {thing.name}",
-            "token": ["the", str(thing.name)],
+            "scene_id": "scene0000_00", "object_id": str(thing.id - 1), "object_name": str(thing.name),
+            "ann_id": "0", "description": f"the {thing.name}", "token": ["the", str(thing.name)],
         }
         for thing in placed
-    ]
+    ]  # fmt: skip
     (tmp_path / "ScanRefer.json").write_text(json.dumps(sentences))
     rows = [f"{thing.name}\t5" for thing in {thing.name: thing for thing in placed}.values()]
     (tmp_path / "map.tsv").write_text("\n".join(["raw_category\tnyu40id", *rows]) + "\n")

@@ -21,17 +21,9 @@ transformers = pytest.importorskip("transformers")
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:`is_gradient_checkpointing`:FutureWarning")]
 
 QUICK = (
-    "choose.source=frames",
-    "choose.candidates=4",
-    "choose.count=2",
-    "image_side=64",
-    "lora.rank=4",
-    "train.steps=3",
-    "train.accumulate=1",
-    "train.warmup=1",
-    "train.log_every=1",
-    "quiet=true",
-)
+    "choose.source=frames", "choose.candidates=4", "choose.count=2", "image_side=64", "lora.rank=4",
+    "train.steps=3", "train.accumulate=1", "train.warmup=1", "train.log_every=1", "quiet=true",
+)  # fmt: skip
 QUESTIONS = (
     ("room_a", "What color is the crate?", ["red", "dark red"]),
     ("room_b", "How many crates are there?", ["2"]),
@@ -150,12 +142,9 @@ def test_situations_of_sqa3d_stand_before_their_questions(given: Path, tmp_path:
     row = {"scene_id": "room_a", "question_id": 220602000000, "situation": "I face a crate.", "question": "Is it red?"}
     (tmp_path / "v1_balanced_questions_train_scannetv2.json").write_text(json.dumps({"questions": [row]}))
     annotation = {
-        "scene_id": "room_a",
-        "question_id": 220602000000,
-        "answers": [{"answer": "yes"}],
-        "position": {"x": 0, "y": 0, "z": 0},
-        "rotation": {"_x": 0, "_y": 0, "_z": 0, "_w": 1},
-    }
+        "scene_id": "room_a", "question_id": 220602000000, "answers": [{"answer": "yes"}],
+        "position": {"x": 0, "y": 0, "z": 0}, "rotation": {"_x": 0, "_y": 0, "_z": 0, "_w": 1},
+    }  # fmt: skip
     path = tmp_path / "v1_balanced_sqa_annotations_train_scannetv2.json"
     path.write_text(json.dumps({"annotations": [annotation]}))
     assert cli.main(words(given, tmp_path / "out", "prepare_only=true", dataset=tmp_path)) == 0

@@ -192,12 +192,9 @@ def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(folde
     # Nobody said what is up; the cameras tell.
     np.testing.assert_allclose(scene.meta["up"], [0, 0, 1], atol=0.1)
     refused = refusal(
-        capsys,
-        "view",
-        str(tmp_path / "dense"),
-        f"words={folder / 'features' / WORDS_FILE}",
+        capsys, "view", str(tmp_path / "dense"), f"words={folder / 'features' / WORDS_FILE}",
         f"out={tmp_path / 'b.html'}",
-    )
+    )  # fmt: skip
     assert "has no text encoder" in refused
     assert "none of 'names'" in refusal(capsys, "view", str(tmp_path / "dense"), "space=names")
 

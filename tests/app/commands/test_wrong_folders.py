@@ -18,20 +18,14 @@ from gsencoder.infer.encode import load_encoder
 from gsencoder.models.output_space import WEIGHTS_FILE, load_output_spaces
 
 WRITTEN = {
-    "fuse": (SCENE_FILE, FEATURES_FILE),
-    "memory": (SCENE_FILE, MEMORY_FILE),
-    "pack": (PACKAGE_FILE,),
-    "train": (WEIGHTS_FILE,),
-    "reconstruct": ("splat.ply",),
-}
+    "fuse": (SCENE_FILE, FEATURES_FILE), "memory": (SCENE_FILE, MEMORY_FILE), "pack": (PACKAGE_FILE,),
+    "train": (WEIGHTS_FILE,), "reconstruct": ("splat.ply",),
+}  # fmt: skip
 KINDS = {name: f"a folder that `gsencoder {name}` wrote" for name in WRITTEN} | {
-    "unfinished": "the state of an unfinished run",
-    "scene": "a scene",
-    "several": "a folder of folders of features (room, …)",
-    "empty": "an empty folder",
-    "missing": "",
+    "unfinished": "the state of an unfinished run", "scene": "a scene",
+    "several": "a folder of folders of features (room, …)", "empty": "an empty folder", "missing": "",
     "notes.csv": "a .csv file",
-}
+}  # fmt: skip
 FEATURES = "expected a folder of features, which `gsencoder fuse`, `encode`, `memory` and `pack` write"
 READERS = {
     "localize, views, ask, pack, view, select, evaluate features=": (

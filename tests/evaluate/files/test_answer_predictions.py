@@ -19,17 +19,11 @@ SCANQA = (
 )
 SQA3D = tuple(
     Question(
-        dataset="sqa3d",
-        id=str(number),
-        scene="s0",
-        text="Which?",
-        situation="I stand.",
-        answers=("left",),
-        position=(float(number), 0.5, 0.0),
-        rotation=(0.8, 0.0, 0.0, 0.6),
+        dataset="sqa3d", id=str(number), scene="s0", text="Which?", situation="I stand.", answers=("left",),
+        position=(float(number), 0.5, 0.0), rotation=(0.8, 0.0, 0.0, 0.6),
     )
     for number in range(2)
-)
+)  # fmt: skip
 
 
 def entry(**changes: Any) -> dict[str, Any]:

@@ -20,12 +20,9 @@ NO_JAVA = "no Java here"
 
 def true_object(number: int, low: float, *captions: str, scene: str = "s0", side: float = 1.0) -> CaptionedObject:
     return CaptionedObject(
-        scene=scene,
-        object_id=number,
-        object_name="chair",
-        captions=captions or (f"sos object {number} eos",),
+        scene=scene, object_id=number, object_name="chair", captions=captions or (f"sos object {number} eos",),
         aabb=((low, 0.0, 0.0), (low + side, side, side)),
-    )
+    )  # fmt: skip
 
 
 def boxes_of(*boxes: tuple[float, str], scene: str = "s0") -> BoxCaptions:
@@ -75,13 +72,9 @@ def test_boxes_of_another_scene_do_not_count() -> None:
 def test_expressions_of_one_object_become_its_references() -> None:
     def expression(number: int, annotation: str, words: str) -> Expression:
         return Expression(
-            scene="s0",
-            object_id=number,
-            object_name="chair",
-            annotation=annotation,
-            text=words,
+            scene="s0", object_id=number, object_name="chair", annotation=annotation, text=words,
             tokens=tuple(words.split()),
-        )
+        )  # fmt: skip
 
     expressions = [expression(3, "0", "a chair ."), expression(1, "0", "b"), expression(3, "1", " ".join("w" * 40))]
     objects = captioned_objects(expressions)

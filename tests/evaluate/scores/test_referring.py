@@ -92,14 +92,9 @@ def test_facts_of_the_prediction_are_taken_where_truth_has_none_and_refused_wher
 def test_an_object_is_alone_among_the_described_objects_of_its_scene() -> None:
     # Scene a: two chairs of three sentences and one bed; scene b: one chair; others are one class in each scene.
     objects = [
-        ("a", "1", "chair"),
-        ("a", "1", "chair"),
-        ("a", "2", "chair"),
-        ("a", "3", "bed"),
-        ("b", "1", "chair"),
-        ("b", "2", OTHERS),
-        ("b", "3", OTHERS),
-    ]
+        ("a", "1", "chair"), ("a", "1", "chair"), ("a", "2", "chair"), ("a", "3", "bed"), ("b", "1", "chair"),
+        ("b", "2", OTHERS), ("b", "3", OTHERS),
+    ]  # fmt: skip
     assert several_of_their_class(objects) == (True, True, True, False, False, True, True)
     # An object counts with the class of its first sentence: of the second's, none is not exactly one.
     assert several_of_their_class([("a", "1", "chair"), ("a", "1", "sofa")]) == (False, True)
