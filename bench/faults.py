@@ -32,9 +32,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from chat_server import answer, serving
-from fault_checks import Checker
+from fault_checks import Checker, Pairs
 from fault_commands import CASES, EXHAUSTIVE
-from fault_pairs import Pairs
 from fault_runs import CUT, DENY, FULL, HALT, IO_ERROR, KILL, READ_ERROR, SHORT, SHORT_FULL, TEAR, VANISH, fault_server
 from json_option import add_json_option, write_figures
 from safetensors.numpy import load_file

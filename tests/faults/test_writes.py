@@ -9,8 +9,7 @@ import random
 from collections.abc import Callable
 
 import pytest
-from fault_checks import Checker, role
-from fault_pairs import Pairs
+from fault_checks import Checker, Pairs, role
 from fault_runs import CUT, DENY, FULL, IO_ERROR, KILL, READ_ERROR, SHORT, SHORT_FULL, TEAR, VANISH
 
 FAULTS = {
