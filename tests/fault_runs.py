@@ -79,16 +79,10 @@ class FaultServer:
     def __init__(self, shim: Path, given: Path) -> None:
         self.given = given
         environment = {
-            **os.environ,
-            "LD_PRELOAD": str(shim),
-            "PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)]),
-            "OMP_NUM_THREADS": "1",
-            "OPENBLAS_NUM_THREADS": "1",
-            "GSENCODER_CACHE": "off",
-            "OPENAI_API_KEY": "none",
-            "GSENCODER_VLM_MODEL": "tiny",
-            "TOKENIZERS_PARALLELISM": "false",
-        }
+            **os.environ, "LD_PRELOAD": str(shim), "PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)]),
+            "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "GSENCODER_CACHE": "off",
+            "OPENAI_API_KEY": "none", "GSENCODER_VLM_MODEL": "tiny", "TOKENIZERS_PARALLELISM": "false",
+        }  # fmt: skip
         environment.pop("OPENAI_BASE_URL", None)
         self._log = (given.parent / "server.log").open("w")
         self._process = subprocess.Popen(

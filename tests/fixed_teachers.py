@@ -58,11 +58,9 @@ def ring(count: int = 5, width: int = 32, height: int = 24) -> Cameras:
     poses = np.repeat(one.cam_from_world, count, axis=0)
     poses[:, 0, 3] = np.linspace(-0.5, 0.5, count)
     return Cameras(
-        cam_from_world=poses,
-        Ks=np.repeat(one.Ks, count, axis=0),
-        widths=np.repeat(one.widths, count),
+        cam_from_world=poses, Ks=np.repeat(one.Ks, count, axis=0), widths=np.repeat(one.widths, count),
         heights=np.repeat(one.heights, count),
-    )
+    )  # fmt: skip
 
 
 def make_scene(n: int = 150, count: int = 5, gaussians: Gaussians | None = None, **views: Any) -> Scene:

@@ -33,12 +33,9 @@ def truth_of(*parts: tuple[int, int, int]) -> np.ndarray:
 def masks_of(*masks: Mask, scene: str = "a") -> InstancePrediction:
     vertices = np.arange(VERTICES)
     return prediction_of_masks(
-        scene,
-        [(vertices >= first) & (vertices < last) for first, last, _, _ in masks],
-        [label for _, _, label, _ in masks],
-        [score for _, _, _, score in masks],
-        num_vertices=VERTICES,
-    )
+        scene, [(vertices >= first) & (vertices < last) for first, last, _, _ in masks],
+        [label for _, _, label, _ in masks], [score for _, _, _, score in masks], num_vertices=VERTICES,
+    )  # fmt: skip
 
 
 def scored(truth: np.ndarray, *masks: Mask, class_agnostic: bool = False) -> InstanceScores:

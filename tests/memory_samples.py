@@ -34,14 +34,9 @@ def make_memory(
     queries[weights == 0] = 0
     bank = make_bank(raw, mean if scoring == "centered" else np.zeros_like(mean), space, cosine=0.95)
     return QueryMemory(
-        queries=queries,
-        weights=weights,
-        projection=rng.normal(size=(width, channels)).astype(np.float32),
-        bank=bank,
-        scoring=scoring,
-        temperature=TEMPERATURE[scoring],
-        mean=mean,
-    )
+        queries=queries, weights=weights, projection=rng.normal(size=(width, channels)).astype(np.float32),
+        bank=bank, scoring=scoring, temperature=TEMPERATURE[scoring], mean=mean,
+    )  # fmt: skip
 
 
 def memory_of_features(

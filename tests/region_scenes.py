@@ -40,19 +40,15 @@ def region_scene(folder: Path | None = None, *, names: Sequence[str] = NAMES, **
     """Two views of a ball of Gaussians, with random photographs."""
     one, rng = front_camera(WIDTH, HEIGHT, 30.0), np.random.default_rng(0)
     cameras = Cameras(
-        cam_from_world=np.repeat(one.cam_from_world, 2, axis=0),
-        Ks=np.repeat(one.Ks, 2, axis=0),
-        widths=np.repeat(one.widths, 2),
-        heights=np.repeat(one.heights, 2),
-    )
+        cam_from_world=np.repeat(one.cam_from_world, 2, axis=0), Ks=np.repeat(one.Ks, 2, axis=0),
+        widths=np.repeat(one.widths, 2), heights=np.repeat(one.heights, 2),
+    )  # fmt: skip
     images = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(2)]
     fields = {"images": images, **views}
     return Scene(
-        name="s",
-        gaussians=random_gaussians(150),
-        views=Views(cameras=cameras, names=tuple(names), **fields),
+        name="s", gaussians=random_gaussians(150), views=Views(cameras=cameras, names=tuple(names), **fields),
         folder=folder,
-    )
+    )  # fmt: skip
 
 
 def scene_object(label: int, name: str | None) -> SceneObject:

@@ -16,11 +16,9 @@ def camera(center=(0.0, 0.0, 0.0), target=(0.0, 0.0, 1.0), size=(320, 240), K=K)
     pose[:3, :3] = [right, np.cross(forward, right), forward]
     pose[:3, 3] = -pose[:3, :3] @ center
     return Cameras(
-        cam_from_world=pose[None].astype(np.float32),
-        Ks=K[None],
-        widths=np.array([size[0]], np.int32),
+        cam_from_world=pose[None].astype(np.float32), Ks=K[None], widths=np.array([size[0]], np.int32),
         heights=np.array([size[1]], np.int32),
-    )
+    )  # fmt: skip
 
 
 def rays(cameras: Cameras) -> np.ndarray:

@@ -126,12 +126,10 @@ def sog_files(count: int = 40, bands: int = 1, seed: int = 0) -> dict[str, bytes
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": np.linspace(-2, 2, 256).tolist(), "files": ["sh0.webp"]},
         "shN": {
-            "count": 64,
-            "bands": bands,
-            "codebook": np.linspace(-1, 1, 256).tolist(),
+            "count": 64, "bands": bands, "codebook": np.linspace(-1, 1, 256).tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         },
-    }
+    }  # fmt: skip
     files = {f"{name}.webp": bytes(imagecodecs.webp_encode(pixels, lossless=True)) for name, pixels in images.items()}
     return {"meta.json": json.dumps(meta).encode(), **files}
 

@@ -76,11 +76,9 @@ def random_cameras(count: int = 20, seed: int = 0, *, spread: float = 3.0) -> Ca
     Ks[:, [0, 1], [0, 1]] = sizes * rng.uniform(0.3, 3.0, (count, 2))
     Ks[:, :2, 2] = sizes * rng.uniform(0.2, 0.8, (count, 2))
     return Cameras(
-        cam_from_world=poses.astype(np.float32),
-        Ks=Ks.astype(np.float32),
-        widths=sizes[:, 0].copy(),
+        cam_from_world=poses.astype(np.float32), Ks=Ks.astype(np.float32), widths=sizes[:, 0].copy(),
         heights=sizes[:, 1].copy(),
-    )
+    )  # fmt: skip
 
 
 def dense(b: Blend) -> np.ndarray:

@@ -137,11 +137,9 @@ def test_points_far_from_the_origin_keep_float64():
 def test_a_point_in_the_plane_of_the_lens_is_in_no_image_and_warns_of_nothing():
     K = intrinsic_matrix(50.0, 50.0, 30.0, 20.0)
     cameras = Cameras(
-        cam_from_world=np.eye(4, dtype=np.float32)[None],
-        Ks=K.astype(np.float32)[None],
-        widths=np.array([60], np.int32),
-        heights=np.array([40], np.int32),
-    )
+        cam_from_world=np.eye(4, dtype=np.float32)[None], Ks=K.astype(np.float32)[None],
+        widths=np.array([60], np.int32), heights=np.array([40], np.int32),
+    )  # fmt: skip
     points = np.array([[0.0, 0, 0], [1, 1, 0], [1e300, 0, 1e-300], [0, 0, -1], [0, 0, 1]])
     pixels, depths = cameras.project(points, 0)
     assert cameras.in_image(pixels, depths, 0).tolist() == [False, False, False, False, True]

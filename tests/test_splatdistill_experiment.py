@@ -20,13 +20,10 @@ from gsencoder.train.losses import LossConfig
 from gsencoder.train.run import TrainConfig
 
 SMALL_MODEL = (
-    "model=tiny",
-    "model.transformer.encoder_depths=[1,1]",
-    "model.transformer.encoder_channels=[32,32]",
-    "model.transformer.decoder_depths=[1]",
-    "model.transformer.decoder_channels=[32]",
+    "model=tiny", "model.transformer.encoder_depths=[1,1]", "model.transformer.encoder_channels=[32,32]",
+    "model.transformer.decoder_depths=[1]", "model.transformer.decoder_channels=[32]",
     "model.transformer.patch=64",
-)
+)  # fmt: skip
 QUICK = (
     "quiet=true", "tensorboard=false", "train.warmup=2", "train.log_every=1", "sampling.views=1",
     "seeds.voxel=0.08",

@@ -13,11 +13,9 @@ from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, Gau
 def camera(width: int, height: int) -> Cameras:
     K = np.array([[[0.7 * width, 0, 0.45 * width], [0, 0.7 * width, 0.55 * height], [0, 0, 1]]], np.float32)
     return Cameras(
-        cam_from_world=np.eye(4, dtype=np.float32)[None],
-        Ks=K,
-        widths=np.array([width], np.int32),
+        cam_from_world=np.eye(4, dtype=np.float32)[None], Ks=K, widths=np.array([width], np.int32),
         heights=np.array([height], np.int32),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("width", "height", "longest"), [(640, 480, 160), (97, 231, 50), (64, 48, 640), (1000, 1, 8)])

@@ -49,11 +49,9 @@ class SideTeacher:
         width, height = int(views.cameras.widths[view]), int(views.cameras.heights[view])
         codes = np.where(np.arange(width) < width // 2, 1, 2).astype(np.int32)
         return FeatureMap(
-            codes=np.broadcast_to(codes, (height, width)).copy(),
-            table=TABLE,
-            grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]),
-            space=SPACE,
-        )
+            codes=np.broadcast_to(codes, (height, width)).copy(), table=TABLE,
+            grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]), space=SPACE,
+        )  # fmt: skip
 
     def settings(self) -> dict[str, Any]:
         return {"name": "sides"}

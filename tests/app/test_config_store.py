@@ -219,12 +219,10 @@ def toy(conf: Path, *words: str) -> ToyConfig:
 def test_choices_come_from_unions_presets_and_experiments_wherever_their_section_lies(conf: Path) -> None:
     choices = choices_of(ToyConfig, conf)
     assert choices.groups == {
-        "student/network": ("large", "tiny"),
-        "student/damage": ("blur", "noise"),
-        "teacher": ("blur", "noise", "wide", "wrong"),
-        "preset": ("balanced", "exact", "fast"),
+        "student/network": ("large", "tiny"), "student/damage": ("blur", "noise"),
+        "teacher": ("blur", "noise", "wide", "wrong"), "preset": ("balanced", "exact", "fast"),
         "experiment": ("long", "none"),
-    }
+    }  # fmt: skip
     assert choices.chosen == {
         "student/network": "tiny", "student/damage": "noise", "teacher": "blur", "preset": "balanced",
         "experiment": "none",

@@ -51,11 +51,9 @@ def labeled_room() -> tuple[Scene, GaussianFeatures]:
     words = np.eye(2, dtype=np.float32)
     space = FeatureSpace(name="s", channels=2, text_encoder="words")
     features = GaussianFeatures(
-        features=words[which.long().numpy()],
-        weights=np.ones(len(which), np.float32),
-        mean=np.full(2, 0.5, np.float32),
-        space=space,
-    )
+        features=words[which.long().numpy()], weights=np.ones(len(which), np.float32),
+        mean=np.full(2, 0.5, np.float32), space=space,
+    )  # fmt: skip
     views = Views(cameras=cameras, names=scene.views.names, instances=instances)
     return replace(scene, views=views, objects=(thing(1, "mug"),)), features
 

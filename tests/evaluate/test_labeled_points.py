@@ -36,16 +36,14 @@ def laid_out(views: int = 1) -> Scene:
         name="made",
         gaussians=gaussians,
         views=Views(
-            cameras=camera.select([0] * views),
-            names=tuple(map(str, range(views))),
-            depths=[np.full((40, 60), 2, np.float32)] * views,
-            instances=[instances] * views,
+            cameras=camera.select([0] * views), names=tuple(map(str, range(views))),
+            depths=[np.full((40, 60), 2, np.float32)] * views, instances=[instances] * views,
         ),
         objects=(
             SceneObject(id=MUG, name="mug", aabb_min=corner, aabb_max=corner + 1),
             SceneObject(id=NAMELESS, name=None, aabb_min=corner, aabb_max=corner + 1),
         ),
-    )
+    )  # fmt: skip
 
 
 def test_a_gaussian_is_of_the_listed_object_on_whose_pixels_it_is_seen() -> None:

@@ -39,11 +39,9 @@ def test_the_figures_of_the_paper_are_those_that_it_prints() -> None:
 
 def test_measured_shares_stand_above_published_percent() -> None:
     table = table_of(
-        "Referring",
-        {"fused": {"acc_25": 0.5, "acc_50": math.nan}},
-        published="splatdistill_5_referring",
+        "Referring", {"fused": {"acc_25": 0.5, "acc_50": math.nan}}, published="splatdistill_5_referring",
         notes=["Why."],
-    )
+    )  # fmt: skip
     assert table.columns == ("acc_25", "acc_50")
     first, *others = csv.DictReader(io.StringIO(csv_text(table.csv_rows())))
     assert first == {"source": "measured", "group": "", "method": "fused", "acc_25": "50", "acc_50": ""}

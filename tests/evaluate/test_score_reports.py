@@ -55,12 +55,10 @@ def instance_folders(folder: Path, truths: dict[str, np.ndarray], masks: dict[st
     for scene, ids in truths.items():
         write_integer_lines(folder / "truth" / f"{scene}.txt", ids)
         made = prediction_of_masks(
-            scene,
-            [(rows >= first) & (rows < last) for first, last, _, _ in masks[scene]],
-            [label for _, _, label, _ in masks[scene]],
-            [score for _, _, _, score in masks[scene]],
+            scene, [(rows >= first) & (rows < last) for first, last, _, _ in masks[scene]],
+            [label for _, _, label, _ in masks[scene]], [score for _, _, _, score in masks[scene]],
             num_vertices=SIZE,
-        )
+        )  # fmt: skip
         write_instance_prediction(folder / "predictions", made)
     return folder / "predictions", folder / "truth"
 
@@ -211,11 +209,8 @@ def test_boxes_of_sentences_are_reported_by_kind_threshold_and_number(tmp_path: 
     far = cube(50)
     # IoUs of the boxes, best first: 0.6; 0.3 and then 0.7; 0.1; none.
     boxes: dict[str, list[list[list[float]]]] = {
-        "0": [cube(0, 0.6)],
-        "1": [cube(10, 0.3), far, cube(10, 0.7)],
-        "2": [cube(20, 0.1)],
-        "3": [],
-    }
+        "0": [cube(0, 0.6)], "1": [cube(10, 0.3), far, cube(10, 0.7)], "2": [cube(20, 0.1)], "3": [],
+    }  # fmt: skip
     truth = [
         {"scene_id": "ab"[row // 3], "object_id": str(row), "object_name": "chair", "ann_id": "0", "token": []}
         | {"description": "x", "bbox": cube(10 * row)}
@@ -224,13 +219,11 @@ def test_boxes_of_sentences_are_reported_by_kind_threshold_and_number(tmp_path: 
     ]
     rows = [
         {
-            "scene_id": each["scene_id"],
-            "object_id": each["object_id"],
-            "ann_id": "0",
+            "scene_id": each["scene_id"], "object_id": each["object_id"], "ann_id": "0",
             "bboxes": boxes[each["object_id"]],
         }
         for each in truth
-    ]
+    ]  # fmt: skip
     files = written(tmp_path / "predictions.json", rows), written(tmp_path / "truth.json", truth)
     report = referring.score(*files, ScoreOptions(method="mine"))
     results = report.results

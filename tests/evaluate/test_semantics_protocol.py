@@ -23,11 +23,9 @@ def line_of(kinds: list[int]) -> tuple[Gaussians, GaussianFeatures]:
     means[:, 0] = np.arange(len(kinds))
     vectors = np.array([[1, 0], [0, 1], [0, 0]], np.float32)
     features = GaussianFeatures(
-        features=vectors[kinds],
-        weights=(np.array(kinds) != UNSEEN).astype(np.float32),
-        mean=np.full(2, 0.5, np.float32),
-        space=WORDS.space,
-    )
+        features=vectors[kinds], weights=(np.array(kinds) != UNSEEN).astype(np.float32),
+        mean=np.full(2, 0.5, np.float32), space=WORDS.space,
+    )  # fmt: skip
     return replace(random_gaussians(len(kinds)), means=means), features
 
 

@@ -41,11 +41,9 @@ def lengths(vectors: np.ndarray) -> np.ndarray:
 def features_of(case: Case) -> GaussianFeatures:
     n = len(case.vectors)
     return GaussianFeatures(
-        features=case.vectors,
-        weights=np.random.default_rng(0).uniform(0.5, 2, n).astype(np.float32),
-        mean=case.vectors.astype(np.float64).mean(axis=0).astype(np.float32),
-        space=SPACE,
-    )
+        features=case.vectors, weights=np.random.default_rng(0).uniform(0.5, 2, n).astype(np.float32),
+        mean=case.vectors.astype(np.float64).mean(axis=0).astype(np.float32), space=SPACE,
+    )  # fmt: skip
 
 
 @routine("basis: moments and eigenvectors", "vectors")

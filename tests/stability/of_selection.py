@@ -125,10 +125,8 @@ def presence_error(case: Case) -> float:
     spread = Wide("1.4826") * away[[(len(away) - 1) // 2, len(away) // 2]].mean()
     height = (wide[rows].max() - median) / max(spread, Wide(SMALLEST_SPREAD))
     evidence = {
-        "mean": (heft @ wide[rows]) / heft.sum(),
-        "prominence": np.log(max(height, Wide(1e-3))),
-        "size": Wide(math.log10(len(rows))),
-        "share": Wide(0.4),
-    }
+        "mean": (heft @ wide[rows]) / heft.sum(), "prominence": np.log(max(height, Wide(1e-3))),
+        "size": Wide(math.log10(len(rows))), "share": Wide(0.4),
+    }  # fmt: skip
     logit = WITHOUT_RIVALS["intercept"] + sum(WITHOUT_RIVALS[name] * value for name, value in evidence.items())
     return float(abs(got - 1 / (1 + np.exp(-logit))))

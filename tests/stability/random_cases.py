@@ -56,11 +56,9 @@ class Recipe:
         quats = rng.normal(size=(self.n, 4))
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
         opacities = (
-            rng.uniform(0, 1, self.n),
-            rng.integers(0, 2, self.n).astype(float),
-            rng.uniform(0, 0.02, self.n),
+            rng.uniform(0, 1, self.n), rng.integers(0, 2, self.n).astype(float), rng.uniform(0, 0.02, self.n),
             np.ones(self.n),
-        )[self.opacity]
+        )[self.opacity]  # fmt: skip
         extent = max(np.abs(local).max(), 1e-30)
         away = 10.0**self.origin * extent * (self.origin > 0)
         center = away * np.array([0.6, -0.64, 0.48])
@@ -68,20 +66,16 @@ class Recipe:
         pose[:3, :3] = random_rotation(rng)
         pose[:3, 3] = -pose[:3, :3] @ center
         gaussians = replace(
-            made.gaussians,
-            means=(center + local @ pose[:3, :3]).astype(np.float32),
-            scales=np.maximum(sizes, 1e-18).astype(np.float32),
-            quats=quats.astype(np.float32),
+            made.gaussians, means=(center + local @ pose[:3, :3]).astype(np.float32),
+            scales=np.maximum(sizes, 1e-18).astype(np.float32), quats=quats.astype(np.float32),
             opacities=opacities.astype(np.float32),
-        )
+        )  # fmt: skip
         focal = self.size / 2 / tangent
         return Case(
-            gaussians=gaussians,
-            cameras=camera(self.size, max(1, self.size * 2 // 3), focal, pose),
-            vectors=vectors_of(self.n, 10.0**self.norm, self.rank, 10.0**self.mean),
-            logits=10.0**self.logits,
+            gaussians=gaussians, cameras=camera(self.size, max(1, self.size * 2 // 3), focal, pose),
+            vectors=vectors_of(self.n, 10.0**self.norm, self.rank, 10.0**self.mean), logits=10.0**self.logits,
             voxel=extent / 20,
-        )
+        )  # fmt: skip
 
 
 LOW = Recipe(1, 0.0, -6.0, -8.0, 0.0, 0, -3.0, -2.0, 1, -8.0, -3.0, 1, 0.0, 0)

@@ -51,11 +51,9 @@ def evaluated(rooms: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 def as_evaluated(protocol: str, evaluated: dict[str, Path]) -> tuple[str, ...]:
     """The options with which `score` takes the files as `evaluate` did."""
     return {
-        "recognition": (),
-        "instances": (f"classes={evaluated['instances'] / 'class_ids.csv'}",),
-        "semantics": (f"classes={evaluated['semantics'] / 'class_ids.csv'}",),
-        "referring": (),
-    }[protocol]
+        "recognition": (), "instances": (f"classes={evaluated['instances'] / 'class_ids.csv'}",),
+        "semantics": (f"classes={evaluated['semantics'] / 'class_ids.csv'}",), "referring": (),
+    }[protocol]  # fmt: skip
 
 
 def scored(protocol: str, evaluated: Path, out: Path, *options: str) -> dict[str, Any]:

@@ -76,11 +76,9 @@ def scan(tmp_path: Path) -> Path:
     """Objects in another order than their ids, of which 8 is missing; two vertices belong to none."""
     segments = np.array([30, 10, 10, 20, 40, 50, 30])
     groups = [
-        group(9, "couch", [20]),
-        group(0, "office chair", [10]),
-        group(4, "wall", [30]),
+        group(9, "couch", [20]), group(0, "office chair", [10]), group(4, "wall", [30]),
         group(7, "beanbag", [40]),
-    ]
+    ]  # fmt: skip
     vertices = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
     return write_scannet_labels(tmp_path / "scans" / "s0", "s0", vertices, segments, groups)
 

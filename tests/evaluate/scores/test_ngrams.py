@@ -145,11 +145,9 @@ def test_a_reference_counts_an_ngram_as_often_as_it_has_it_and_a_document_counts
 
 def test_sentences_and_references_stay_with_their_samples() -> None:
     scores = score_sentences(
-        ["A chair.", "two lamps", "x"],
-        [["A chair."], ["one", "Two lamps!"], ["y z", "x"]],
-        tokens="python",
+        ["A chair.", "two lamps", "x"], [["A chair."], ["one", "Two lamps!"], ["y z", "x"]], tokens="python",
         tools="no Java here",
-    )
+    )  # fmt: skip
     assert scores.rouge_l_each.tolist() == pytest.approx([1, 1, 1])
     assert not scores.official
     assert math.isnan(scores.meteor)

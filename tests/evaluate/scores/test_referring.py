@@ -117,11 +117,9 @@ def expression(number: int, name: str, scene: str = "a", **stated: bool) -> Expr
 
 def test_what_a_file_says_of_a_sentence_is_kept_and_the_rest_is_counted() -> None:
     sentences = (
-        expression(1, "office_chair"),
-        expression(2, "armchair"),
-        expression(3, "cart", multiple=True, others=False),
-        expression(1, "armchair", scene="b"),
-    )
+        expression(1, "office_chair"), expression(2, "armchair"),
+        expression(3, "cart", multiple=True, others=False), expression(1, "armchair", scene="b"),
+    )  # fmt: skip
     kinds = with_kinds(sentences, {"office_chair": "chair", "armchair": "chair", "cart": OTHERS})
     assert [each.multiple for each in kinds] == [True, True, True, False]
     assert [each.others for each in kinds] == [False, False, False, False]

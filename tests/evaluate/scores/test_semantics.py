@@ -70,10 +70,7 @@ def test_the_ceiling_is_of_the_background_and_no_class_is_of_none() -> None:
     scores = semantic_scores([count_labels("s", truth, labels, classes)], classes)
     assert scores.figures["f_miou"] == pytest.approx((1 / 2 + 0) / 2)
     assert {name: (each["truths"], each["predictions"]) for name, each in scores.classes.items()} == {
-        "ceiling": (1, 2),
-        "bed": (2, 1),
-        "floor": (1, 1),
-        "lamp": (1, 0),
-    }
+        "ceiling": (1, 2), "bed": (2, 1), "floor": (1, 1), "lamp": (1, 0),
+    }  # fmt: skip
     # A class that is there and never predicted counts among those in truth.
     assert scores.figures["miou_present"] == pytest.approx((1 / 2 + 1 / 2 + 1 + 0) / 4)
