@@ -91,6 +91,12 @@ class Checker:
         words = [*self.reference.words, f"out={folder / self.reference.case.out}", *more]
         return self.server.run(words, folder, at=at, action=action)
 
+    def run_before(self, folder: Path) -> None:
+        """Leaves results that the next run is to replace."""
+        assert self.run(folder).code == 0
+        for each in self.reference.case.beside:
+            shutil.rmtree(folder / each, ignore_errors=True)
+
     def check(self, at: int, action: int, *, over: bool = False) -> list[str]:
         """Puts a fault at a call; what did not hold. With `over` the run replaces earlier results."""
         ref, folder, wrong = self.reference, self.new(), []
@@ -98,9 +104,7 @@ class Checker:
         more: tuple[str, ...] = ()
         earlier: dict[str, str] = {}
         if over:
-            assert self.run(folder).code == 0
-            for each in ref.case.beside:
-                shutil.rmtree(folder / each, ignore_errors=True)
+            self.run_before(folder)
             if out.is_dir():
                 (out / "earlier.txt").write_text("earlier")
             earlier, more = contents(out), ("overwrite=true",)
@@ -277,9 +281,7 @@ class Pairs:
         folder = checker.new()
         more: tuple[str, ...] = ()
         if over:
-            assert checker.run(folder).code == 0
-            for each in ref.case.beside:
-                shutil.rmtree(folder / each, ignore_errors=True)
+            checker.run_before(folder)
             more = ("overwrite=true",)
         words = [*ref.words, *more, f"out={folder / ref.case.out}"]
         first = checker.server.run(words, folder, at=at, action=HALT, meanwhile=[*words, *ref.case.other])

@@ -1,5 +1,6 @@
 """Teachers whose maps are given, and small scenes to fuse them on, that several test files stand on."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,13 +55,10 @@ class CodedTeacher(FixedTeacher):
 
 def ring(count: int = 5, width: int = 32, height: int = 24) -> Cameras:
     """Cameras in a row, all looking along +z."""
-    one = front_camera(width, height, 30.0)
-    poses = np.repeat(one.cam_from_world, count, axis=0)
+    one = front_camera(width, height, 30.0).select([0] * count)
+    poses = one.cam_from_world.copy()
     poses[:, 0, 3] = np.linspace(-0.5, 0.5, count)
-    return Cameras(
-        cam_from_world=poses, Ks=np.repeat(one.Ks, count, axis=0), widths=np.repeat(one.widths, count),
-        heights=np.repeat(one.heights, count),
-    )  # fmt: skip
+    return replace(one, cam_from_world=poses)
 
 
 def make_scene(n: int = 150, count: int = 5, gaussians: Gaussians | None = None, **views: Any) -> Scene:

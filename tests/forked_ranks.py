@@ -64,7 +64,6 @@ class RankServer:
         )  # fmt: skip
 
     def ask(self, **request: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None
         print(json.dumps(request), file=self._process.stdin, flush=True)
         return json.loads(self._process.stdout.readline())
 

@@ -42,7 +42,6 @@ class BlendedTeacher:
         grid = np.array([[0.5, 0, 0], [0, 0.5, 0]])
         empty = np.zeros((HEIGHT, WIDTH, self.space.channels), np.float32)
         like = FeatureMap(features=empty, grid_from_image=grid, space=self.space)
-        assert self._scene.gaussians is not None
         b = blend(self._scene.gaussians, views.cameras, view, like=like)
         alpha = b.alpha.numpy()[:, None]
         features = b.render(torch.from_numpy(self.hidden)).numpy() / np.maximum(alpha, 1e-6)

@@ -64,7 +64,6 @@ def plain_relevancy(
     scene: Scene, cameras: Cameras, text: TextTable, names: tuple[str, ...]
 ) -> Float64[np.ndarray, "Q P"]:
     """The definition: features of all channels are rendered, then centered cosines; −2 where alpha is below 0.5."""
-    assert scene.gaussians is not None
     features = scene.features["toy"]
     b = blend(scene.gaussians, cameras)
     dense = np.zeros((b.rows, b.gaussians))

@@ -9,21 +9,12 @@ from gsencoder.data.synthetic import make_room, write_room
 
 SEEDS = ("seeds.voxel=0.12",)
 QUICK = (
-    "quiet=true",
-    "tensorboard=false",
-    # One level: heads follow the encoder, and a graph of two takes twice as long to export.
-    "model.transformer.encoder_depths=[1]",
-    "model.transformer.encoder_channels=[32]",
-    "model.transformer.decoder_depths=[]",
-    "model.transformer.decoder_channels=[]",
-    "model.transformer.patch=64",
-    "train.steps=3",
-    "train.warmup=1",
-    "train.log_every=1",
-    "sampling.views=1",
-    "sampling.gaussians=400",
-    "sampling.smallest=100",
-)
+    "quiet=true", "tensorboard=false", "model.transformer.encoder_depths=[1]", "model.transformer.patch=64",
+    "model.transformer.encoder_channels=[32]", "model.transformer.decoder_depths=[]", "train.steps=3",
+    "model.transformer.decoder_channels=[]", "train.warmup=1", "train.log_every=1", "sampling.views=1",
+    "sampling.gaussians=400", "sampling.smallest=100",
+)  # fmt: skip
+"""With one level: heads follow the encoder, and a graph of two takes twice as long to export."""
 
 
 class World:

@@ -67,17 +67,12 @@ def head_weights(prefix: str, version: str, sizes: dict[str, int], pre_norm: boo
     width, hidden, outputs = sizes["input_dim"], sizes["hidden_dim"], sizes["output_dim"]
 
     def linear(key: str, inputs: int, out: int) -> dict[str, Any]:
-        scale = (2 / inputs) ** 0.5
-        return {
-            f"{prefix}{key}.weight": torch.randn(out, inputs) * scale,
-            f"{prefix}{key}.bias": torch.randn(out) * 0.1,
-        }
+        weight = torch.randn(out, inputs) * (2 / inputs) ** 0.5
+        return {f"{prefix}{key}.weight": weight, f"{prefix}{key}.bias": torch.randn(out) * 0.1}
 
     def norm(key: str, channels: int) -> dict[str, Any]:
-        return {
-            f"{prefix}{key}.weight": 1 + 0.1 * torch.randn(channels),
-            f"{prefix}{key}.bias": torch.randn(channels) * 0.1,
-        }
+        weight = 1 + 0.1 * torch.randn(channels)
+        return {f"{prefix}{key}.weight": weight, f"{prefix}{key}.bias": torch.randn(channels) * 0.1}
 
     if version == "v1":
         weights = linear("fc1", width, hidden) | norm("norm", hidden) | linear("fc2", hidden, outputs)

@@ -14,7 +14,7 @@ from splats import front_camera, random_gaussians
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.regions import OnnxRegionOptions, RegionsConfig
 from gsencoder.text.table import TextTable, make_text_table, unit
-from gsencoder.types import Cameras, FeatureMap, Scene, SceneObject, Views
+from gsencoder.types import FeatureMap, Scene, SceneObject, Views
 
 HEIGHT, WIDTH = 24, 32
 NAMES = ("images/a.jpg", "images/b.jpg")
@@ -38,11 +38,7 @@ def write_masks(folder: Path, names: Sequence[str] = ("a", "b")) -> Path:
 
 def region_scene(folder: Path | None = None, *, names: Sequence[str] = NAMES, **views: Any) -> Scene:
     """Two views of a ball of Gaussians, with random photographs."""
-    one, rng = front_camera(WIDTH, HEIGHT, 30.0), np.random.default_rng(0)
-    cameras = Cameras(
-        cam_from_world=np.repeat(one.cam_from_world, 2, axis=0), Ks=np.repeat(one.Ks, 2, axis=0),
-        widths=np.repeat(one.widths, 2), heights=np.repeat(one.heights, 2),
-    )  # fmt: skip
+    cameras, rng = front_camera(WIDTH, HEIGHT, 30.0).select([0, 0]), np.random.default_rng(0)
     images = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(2)]
     fields = {"images": images, **views}
     return Scene(
@@ -103,6 +99,4 @@ def build(masks: Path, model: Path, vector: str, words: TextTable | None = None,
 
 
 def made(teacher: Teacher, view: int) -> FeatureMap:
-    scene = region_scene()
-    assert scene.views is not None
-    return teacher.feature_map(scene.views, view)
+    return teacher.feature_map(region_scene().views, view)

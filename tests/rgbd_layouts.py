@@ -18,8 +18,6 @@ def _picture(path: Path, values: np.ndarray) -> None:
 
 def _frames(scene: Scene) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Photograph, depth in metres and world_from_camera of each view."""
-    assert scene.views.images is not None
-    assert scene.views.depths is not None
     poses = scene.views.cameras.world_from_cam.astype(np.float64)
     poses[:, :3, 3] += scene.origin
     return list(zip(scene.views.images, scene.views.depths, poses, strict=True))

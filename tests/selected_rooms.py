@@ -77,7 +77,6 @@ def selected_room(*, under: bool = True) -> tuple[Scene, np.ndarray]:
 def with_more(scene: Scene, means: np.ndarray, *, opacity: float) -> Scene:
     """The scene with further Gaussians that have no features, at the end."""
     gaussians, features = scene.gaussians, scene.features["names"]
-    assert gaussians is not None
     more = splat_of(means, opacity)
     joined = {
         name: np.concatenate([getattr(gaussians, name), getattr(more, name)])

@@ -112,3 +112,50 @@ def test_figures_are_read_from_what_commands_wrote(entries: tuple[Any, ...], tmp
         assert read == sample["figures"]
     # The readers of all scripts but those that take minutes on a small scene.
     assert len(samples) >= 15
+
+
+# The run on a GPU (`make gpu`), smaller and on a CPU: every part works, and a failure of one hides no other
+
+LEFT_OUT = ("processes", "onnx")
+"""Parts that take long here, and whose work tests of training and of exports do."""
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What bench/gpu.py defines."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return runpy.run_path(str(BENCH / "gpu.py"))
+
+
+def run_gpu(gpu: dict[str, Any], monkeypatch: pytest.MonkeyPatch, out: Path, *words: str) -> tuple[int, list[Any]]:
+    """The exit code and the parts of the report."""
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--small", "--device", "cpu", "--out", str(out), *words])
+    code = gpu["main"]()
+    return code, json.loads(out.with_suffix(".json").read_text())
+
+
+@pytest.mark.slow
+def test_every_part_is_well_on_a_cpu_or_says_why_it_is_skipped(gpu, tmp_path, monkeypatch):
+    names = [name for name in gpu["PARTS"] if name not in LEFT_OUT]
+    code, parts = run_gpu(gpu, monkeypatch, tmp_path / "gpu.md", "--parts", ",".join(names))
+    states = {each["part"]: each["state"] for each in parts}
+    assert list(states) == names
+    allowed = re.compile(r"ok|skipped: (no CUDA device|package missing: .+)")
+    assert [f"{name}: {state}" for name, state in states.items() if not allowed.fullmatch(state)] == []
+    assert states["blend"] == states["losses"] == "ok"
+    assert code == 0
+    report = (tmp_path / "gpu.md").read_text()
+    assert all(f"| {name} |" in report for name in states)
+
+
+def test_a_part_that_raises_is_reported_and_hides_no_other(gpu, tmp_path, monkeypatch):
+    def broken(setting: Any) -> list[Any]:
+        raise ValueError("a kernel | was lost\nin two lines")
+
+    chosen = {"environment": gpu["environment"], "broken": broken, "products": gpu["PARTS"]["products"]}
+    gpu["PARTS"].clear()
+    gpu["PARTS"].update(chosen)
+    code, parts = run_gpu(gpu, monkeypatch, tmp_path / "gpu.md", "--parts", "environment,broken,products")
+    assert code == 1
+    assert [each["state"].split(" (")[0] for each in parts] == ["ok", "failed: ValueError: a kernel | was lost", "ok"]
+    assert "| broken | failed: ValueError: a kernel \\| was lost" in (tmp_path / "gpu.md").read_text()

@@ -1,6 +1,7 @@
 """Laws of the pinhole and of rigid transforms in numpy, and what pycolmap and scipy say of the same cameras."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from splats import random_cameras
+from splats import front_camera, random_cameras
 
 from gsencoder.data.readers.posed import load_pycolmap
 from gsencoder.types import Cameras
@@ -120,14 +121,9 @@ def test_all_cameras_at_once_are_each_camera_after_the_other():
 
 def test_points_far_from_the_origin_keep_float64():
     """A camera that is known exactly, 10⁶ m away from the points' origin, tells millimetres apart."""
-    poses = np.eye(4)[None].repeat(1, axis=0)
-    poses[0, :3, 3] = -(2.0**20)
-    cameras = Cameras(
-        cam_from_world=poses.astype(np.float32),
-        Ks=intrinsic_matrix(500.0, 500.0, 320.0, 240.0).astype(np.float32)[None],
-        widths=np.array([640], np.int32),
-        heights=np.array([480], np.int32),
-    )
+    pose = np.eye(4, dtype=np.float32)[None]
+    pose[0, :3, 3] = -(2.0**20)
+    cameras = replace(front_camera(640, 480, 500.0), cam_from_world=pose)
     points = 2.0**20 + np.array([[0.0, 0, 1], [0.001, 0, 1]])
     pixels, _ = cameras.project(points, 0)
     np.testing.assert_allclose(pixels, [[320, 240], [320.5, 240]], atol=1e-6)
@@ -135,11 +131,7 @@ def test_points_far_from_the_origin_keep_float64():
 
 
 def test_a_point_in_the_plane_of_the_lens_is_in_no_image_and_warns_of_nothing():
-    K = intrinsic_matrix(50.0, 50.0, 30.0, 20.0)
-    cameras = Cameras(
-        cam_from_world=np.eye(4, dtype=np.float32)[None], Ks=K.astype(np.float32)[None],
-        widths=np.array([60], np.int32), heights=np.array([40], np.int32),
-    )  # fmt: skip
+    cameras = front_camera(60, 40, 50.0)
     points = np.array([[0.0, 0, 0], [1, 1, 0], [1e300, 0, 1e-300], [0, 0, -1], [0, 0, 1]])
     pixels, depths = cameras.project(points, 0)
     assert cameras.in_image(pixels, depths, 0).tolist() == [False, False, False, False, True]

@@ -154,7 +154,6 @@ def reconstruction(folder: Path) -> Made:
 
     def read() -> Any:
         got = load_state(folder / "r", {"rate": 0.1}, sh_degree=1)
-        assert got.anchor is not None
         tables = [getattr(got.adam, kind) for kind in RowAdam.KINDS]
         return tables, got.adam.steps, got.anchor, got.exposures, got.step, got.seconds, got.facts
 
@@ -163,7 +162,6 @@ def reconstruction(folder: Path) -> Made:
 
 def teacher_map(folder: Path) -> Made:
     views = scene(0).views
-    assert views is not None
     write_map(folder / "m", DenseSideTeacher().feature_map(views, 0))
     return folder / "m", lambda: read_map(folder / "m", DenseSideTeacher.space)
 

@@ -76,13 +76,10 @@ def test_training_leaves_one_encoder_with_the_spaces_words_and_scores_of_both_te
     assert len(list((prepared / "palette" / "scenes").iterdir())) == 3
 
 
-def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named(
-    rooms: Path, trained: Path, encoded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_encoding_writes_the_features_of_all_teachers_or_of_those_named(rooms, trained, encoded, tmp_path, capsys):
     scene = load_features(encoded)
     assert set(scene.features) == {"labels", "palette"}
     assert set(results_of(encoded)["teachers"]) == {"labels", "palette"}
-    assert scene.gaussians is not None
     direct = Encoder.load(str(trained)).encode_spaces(scene.gaussians, metres_per_unit=1.0)
     for name, features in direct.items():
         np.testing.assert_allclose(scene.features[name].features, features.features, atol=5e-3)

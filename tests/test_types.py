@@ -142,11 +142,7 @@ def test_codes_and_shares_belong_to_rows_of_their_table_and_those_to_the_space(n
 
 
 def test_features_and_their_mean_are_arrays_of_the_space_with_finite_weights(no_jaxtyping):
-    good = {
-        "features": np.zeros((3, 2), np.float32),
-        "weights": np.zeros(3, np.float32),
-        "mean": np.zeros(2, np.float32),
-    }
+    good = {name: np.zeros(shape, np.float32) for name, shape in (("features", (3, 2)), ("weights", 3), ("mean", 2))}
     assert not GaussianFeatures(**good, space=GRID["space"]).seen.any()
     for name, value in (
         ("features", np.zeros((3, 3), np.float32)),

@@ -56,12 +56,8 @@ def save_tiny_vlm(folder: Path, spread: float = 1.0) -> None:
         pad_token_id=words.pad_token_id,
         scale_factor=2,
         vision_config={
-            "hidden_size": 32,
-            "intermediate_size": 64,
-            "num_hidden_layers": 2,
-            "num_attention_heads": 2,
-            "image_size": SIDE,
-            "patch_size": PATCH,
+            "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2,
+            "image_size": SIDE, "patch_size": PATCH,
         },
         text_config={
             "model_type": "llama", "hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 2,

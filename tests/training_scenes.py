@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from safetensors.numpy import load_file
+from splats import front_camera
 
 from gsencoder.core.archive import open_archive
 from gsencoder.core.logs import LOG_FILE, read_log
@@ -20,7 +21,7 @@ from gsencoder.train.prepare import PrepareConfig, add_scene, fit_space
 from gsencoder.train.prepared import PreparedDataset
 from gsencoder.train.run import encoder_trainer
 from gsencoder.train.samples import Augmentation, SampleDataset, SampleRecipe, SamplingConfig, TrainingScene
-from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
+from gsencoder.types import FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
 TABLE = np.array([[0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]], np.float32)
 SPACE = FeatureSpace(name="sides", channels=4)
@@ -77,12 +78,7 @@ def scene(number: int, count: int = 400) -> Scene:
     quats = rng.normal(size=(count, 4))
     poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
     poses[1, 2, 3] = 0.2
-    cameras = Cameras(
-        cam_from_world=poses,
-        Ks=np.tile(np.array([[40, 0, 24], [0, 40, 20], [0, 0, 1]], np.float32), (2, 1, 1)),
-        widths=np.full(2, 48, np.int32),
-        heights=np.full(2, 40, np.int32),
-    )
+    cameras = replace(front_camera(48, 40, 40.0).select([0, 0]), cam_from_world=poses)
     gaussians = Gaussians(
         means=means,
         quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
@@ -96,14 +92,12 @@ def scene(number: int, count: int = 400) -> Scene:
 
 def prepared(folder: Path, *, count: int = 3, teacher: Teacher | None = None) -> tuple[PreparedDataset, list[str]]:
     """Some scenes, prepared in a folder."""
-    teacher = teacher or SideTeacher()  # type: ignore[assignment]
-    assert teacher is not None
+    chosen = teacher or SideTeacher()
     dataset = PreparedDataset(folder, {"made": "for a test"})
     names = [f"wall_{number}" for number in range(count)]
-    chosen: Teacher = teacher
     fit_space(dataset, [Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
     for number in range(count):
-        add_scene(dataset, scene(number), teacher, PREPARE, source=Path(f"wall_{number}"))
+        add_scene(dataset, scene(number), chosen, PREPARE, source=Path(f"wall_{number}"))
     dataset.count_classes(names, untracked)
     return dataset, names
 

@@ -25,40 +25,28 @@ JOINT_CHANNELS = 10
 SAM_CHANNELS = 12
 
 
+SIGLIP = {"model_type": "siglip_vision_model", "vision_use_head": False, **VISION}
+GEMMA = {**SMALL, "vocab_size": 40, "num_key_value_heads": 1, "head_dim": 8}
+
+
+def model(kind: str, **settings: Any) -> Any:
+    """A model of the library by the first part of its classes' names; of those that speak, the whole."""
+    whole = getattr(transformers, f"{kind}ForConditionalGeneration", None)
+    return (whole or getattr(transformers, f"{kind}Model"))(getattr(transformers, f"{kind}Config")(**settings))
+
+
 def clip() -> Any:
-    text, vision = {**TEXT, "projection_dim": JOINT_CHANNELS}, {**VISION, "projection_dim": JOINT_CHANNELS}
-    return transformers.CLIPModel(
-        transformers.CLIPConfig(text_config=text, vision_config=vision, projection_dim=JOINT_CHANNELS)
-    )
-
-
-def siglip() -> Any:
-    return transformers.SiglipModel(
-        transformers.SiglipConfig(text_config={**TEXT, "projection_size": 16}, vision_config=VISION)
-    )
+    joint = {"projection_dim": JOINT_CHANNELS}
+    return model("CLIP", text_config={**TEXT, **joint}, vision_config={**VISION, **joint}, **joint)
 
 
 def siglip2() -> Any:
     vision = {**SMALL, "num_patches": (SIDE // PATCH) ** 2, "patch_size": PATCH}
-    return transformers.Siglip2Model(
-        transformers.Siglip2Config(text_config={**TEXT, "projection_size": 16}, vision_config=vision)
-    )
+    return model("Siglip2", text_config={**TEXT, "projection_size": 16}, vision_config=vision)
 
 
-def dinov2() -> Any:
-    return transformers.Dinov2Model(transformers.Dinov2Config(**SHAPE, image_size=SIDE, patch_size=PATCH, mlp_ratio=2))
-
-
-def dinov2_with_registers() -> Any:
-    return transformers.Dinov2WithRegistersModel(
-        transformers.Dinov2WithRegistersConfig(
-            **SHAPE, image_size=SIDE, patch_size=PATCH, mlp_ratio=2, num_register_tokens=3
-        )
-    )
-
-
-def dinov3() -> Any:
-    return transformers.DINOv3ViTModel(transformers.DINOv3ViTConfig(**VISION, num_register_tokens=2))
+def dinov2(kind: str = "Dinov2", **settings: int) -> Any:
+    return model(kind, **SHAPE, image_size=SIDE, patch_size=PATCH, mlp_ratio=2, **settings)
 
 
 def sam() -> Any:
@@ -67,59 +55,40 @@ def sam() -> Any:
         "output_channels": SAM_CHANNELS, "mlp_dim": 24,
     }  # fmt: skip
     prompts = {"hidden_size": 16, "image_size": SIDE, "patch_size": PATCH, "image_embedding_size": SIDE // PATCH}
-    return transformers.SamModel(
-        transformers.SamConfig(
-            vision_config=vision,
-            prompt_encoder_config=prompts,
-            mask_decoder_config={"hidden_size": 16, "num_attention_heads": 2, "mlp_dim": 16},
-        )
-    )
-
-
-def llava() -> Any:
-    return transformers.LlavaForConditionalGeneration(
-        transformers.LlavaConfig(
-            vision_config={"model_type": "clip_vision_model", **VISION}, text_config=LLAMA, image_token_index=3
-        )
-    )
-
-
-def paligemma() -> Any:
-    vision = {"model_type": "siglip_vision_model", "vision_use_head": False, **VISION}
-    text = {"model_type": "gemma", **SMALL, "vocab_size": 40, "num_key_value_heads": 1, "head_dim": 8}
-    return transformers.PaliGemmaForConditionalGeneration(
-        transformers.PaliGemmaConfig(vision_config=vision, text_config=text, image_token_index=3)
-    )
+    masks = {"hidden_size": 16, "num_attention_heads": 2, "mlp_dim": 16}
+    return model("Sam", vision_config=vision, prompt_encoder_config=prompts, mask_decoder_config=masks)
 
 
 def gemma3() -> Any:
-    vision = {"model_type": "siglip_vision_model", "vision_use_head": False, **VISION}
-    text = {"model_type": "gemma3_text", **SMALL, "vocab_size": 40, "num_key_value_heads": 1, "head_dim": 8}
     tokens = {"mm_tokens_per_image": 4, "image_token_index": 3, "boi_token_index": 4, "eoi_token_index": 5}
-    return transformers.Gemma3ForConditionalGeneration(
-        transformers.Gemma3Config(vision_config=vision, text_config=text, **tokens)
-    )
+    return model("Gemma3", vision_config=SIGLIP, text_config={"model_type": "gemma3_text", **GEMMA}, **tokens)
 
 
-def idefics3() -> Any:
-    return transformers.Idefics3ForConditionalGeneration(
-        transformers.Idefics3Config(vision_config=VISION, text_config=LLAMA, image_token_id=3, pad_token_id=0)
-    )
+def llava() -> Any:
+    vision = {"model_type": "clip_vision_model", **VISION}
+    return model("Llava", vision_config=vision, text_config=LLAMA, image_token_index=3)
 
 
-def smolvlm() -> Any:
-    return transformers.SmolVLMForConditionalGeneration(
-        transformers.SmolVLMConfig(vision_config=VISION, text_config=LLAMA, image_token_id=3, pad_token_id=0)
-    )
+def idefics3(kind: str = "Idefics3") -> Any:
+    return model(kind, vision_config=VISION, text_config=LLAMA, image_token_id=3, pad_token_id=0)
 
 
 MAKERS: Mapping[str, Callable[[], Any]] = {
-    make.__name__: make
-    for make in (
-        clip, siglip, siglip2, dinov2, dinov2_with_registers, dinov3, sam, llava, paligemma, gemma3, idefics3,
-        smolvlm,
-    )
-}  # fmt: skip
+    "clip": clip,
+    "siglip": lambda: model("Siglip", text_config={**TEXT, "projection_size": 16}, vision_config=VISION),
+    "siglip2": siglip2,
+    "dinov2": dinov2,
+    "dinov2_with_registers": lambda: dinov2("Dinov2WithRegisters", num_register_tokens=3),
+    "dinov3": lambda: model("DINOv3ViT", **VISION, num_register_tokens=2),
+    "sam": sam,
+    "llava": llava,
+    "paligemma": lambda: model(
+        "PaliGemma", vision_config=SIGLIP, text_config={"model_type": "gemma", **GEMMA}, image_token_index=3
+    ),
+    "gemma3": gemma3,
+    "idefics3": idefics3,
+    "smolvlm": lambda: idefics3("SmolVLM"),
+}
 
 
 def processor_of(kind: str) -> Any:
@@ -192,9 +161,7 @@ def teacher(folder: Path, **settings: Any) -> TransformersTeacher:
 
 
 def features(folder: Path, image: np.ndarray = WIDE, **settings: Any) -> np.ndarray:
-    made = teacher(folder, **settings).feature_map(views(image), 0).features
-    assert made is not None
-    return made
+    return teacher(folder, **settings).feature_map(views(image), 0).features
 
 
 def rewrite(path: Path, **changes: Any) -> None:

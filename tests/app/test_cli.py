@@ -172,9 +172,7 @@ def wrapped(stop: Stopped) -> SystemError:
 def test_what_ends_a_run_early_is_one_line(toy, error, code, problem, tmp_path, capsys, monkeypatch):
     def run(config: Any, summary: Any) -> None:
         with output_folder(config.out):
-            if isinstance(error, OSError):
-                pass
-            else:
+            if not isinstance(error, OSError):
                 raise error
         raise error
 

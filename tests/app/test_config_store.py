@@ -274,27 +274,37 @@ def composed(*words: str) -> TrainCommandConfig:
     return compose("train", TrainCommandConfig, ["ROOMS", *words])
 
 
-@pytest.mark.parametrize("word", ["teacher=palette", "teacher.words=names.npz"])
-def test_options_of_a_single_teacher_are_refused_where_the_experiment_has_several(word: str) -> None:
-    key = word.partition("=")[0]
-    with pytest.raises(InputError, match=rf"^{key}: is for a single teacher, and experiment=house gives several; "):
-        composed("experiment=house", word)
-    assert composed(word).teachers == {}
+SINGLE, AGAIN = (
+    "is for a single teacher, and experiment=house gives several; ",
+    "is given by experiment=house and once more",
+)
 
 
-def test_options_of_one_of_the_teachers_of_an_experiment_are_given_by_its_name() -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["experiment=house", "teacher=palette"], f"teacher: {SINGLE}"),
+        (["experiment=house", "teacher.words=names.npz"], f"teacher.words: {SINGLE}"),
+        (["experiment=house", "teacher=[labels,palette]"], f"teachers.labels: {AGAIN}; leave out"),
+        (["experiment=house", "teachers=[labels]"], f"teachers.labels: {AGAIN}; leave out"),
+        (["teacher=[labels]", "teachers.palette.cell=4"], ".*there is no palette among the teachers of this run"),
+        (["experiment=[house,house]"], r"experiment: house is given twice in \[house,house\]"),
+    ],
+)
+def test_teachers_and_experiments_that_contradict_each_other_are_refused(words: list[str], message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}"):
+        composed(*words)
+
+
+def test_a_single_teacher_has_its_options_and_one_of_several_by_its_name() -> None:
+    for word in ("teacher=palette", "teacher.words=names.npz"):
+        assert composed(word).teachers == {}
     assert composed("experiment=house", "teachers.dinov2_s14.size=224").teachers["dinov2_s14"].size == 224  # type: ignore[union-attr]
+    with pytest.raises(InputError, match="^teachers.labels.words: this command takes a single teacher; give"):
+        compose("fuse", FuseCommandConfig, ["ROOM", "teachers.labels.words=names.npz"])
 
 
-@pytest.mark.parametrize("teachers", ["teacher=[labels,palette]", "teachers=[labels]"])
-def test_teachers_of_an_experiment_cannot_be_given_again(teachers: str) -> None:
-    with pytest.raises(InputError, match="^teachers.labels: is given by experiment=house and once more; leave out"):
-        composed("experiment=house", teachers)
-
-
-def test_an_experiment_is_listed_once_and_exists_with_several_runs_too(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^experiment: house is given twice in \[house,house\]"):
-        composed("experiment=[house,house]")
+def test_an_experiment_exists_with_several_runs_too(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="^experiment: expected one of house, .*got 'nope'"):
         run_sweep("train", TrainCommandConfig, ["ROOMS", "experiment=house,nope", f"out={tmp_path}"], lambda config: "")
 
@@ -305,10 +315,3 @@ def test_an_empty_list_of_scenes_to_hold_out_replaces_that_of_the_experiment() -
         assert composed("experiment=house", empty).holdout == ()
     assert composed("holdout=[room_0, room_1*]").holdout == ("room_0", "room_1*")
     assert composed("holdout=room_[0-3]").holdout == ("room_[0-3]",)
-
-
-def test_a_command_that_takes_one_teacher_says_so_where_options_of_several_are_given() -> None:
-    with pytest.raises(InputError, match="^teachers.labels.words: this command takes a single teacher; give"):
-        compose("fuse", FuseCommandConfig, ["ROOM", "teachers.labels.words=names.npz"])
-    with pytest.raises(InputError, match="there is no palette among the teachers of this run"):
-        composed("teacher=[labels]", "teachers.palette.cell=4")

@@ -45,13 +45,10 @@ def test_a_folder_appears_whole_when_the_block_ends(tmp_path: Path) -> None:
     assert names(path.parent) == ["out"]
 
 
-def test_whatever_ends_the_block_early_leaves_nothing(tmp_path: Path) -> None:
+def test_a_block_that_ends_early_leaves_nothing_but_the_earlier_results(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_and_raise(tmp_path / "out", KeyboardInterrupt())
     assert names(tmp_path) == []
-
-
-def test_a_failed_run_leaves_the_earlier_results_alone(tmp_path: Path) -> None:
     fill(tmp_path / "out", "old")
     with pytest.raises(ZeroDivisionError):
         write_and_raise(tmp_path / "out", ZeroDivisionError(), overwrite=True)
@@ -262,16 +259,6 @@ def test_a_place_that_cannot_be_written_is_a_named_error(tmp_path: Path) -> None
         fill(tmp_path / "file" / "deep" / "out", "x")
 
 
-def test_a_name_longer_than_the_system_allows_is_refused_before_the_work(tmp_path: Path) -> None:
-    with (
-        pytest.raises(InputError, match="cannot write here: File name too long"),
-        output_folder(tmp_path / ("x" * 300)),
-    ):
-        raise AssertionError("the block must not begin")
-    fill(tmp_path / ("ü" * 127), "x")
-    assert names(tmp_path) == ["ü" * 127]
-
-
 def test_inputs_inside_the_folder_to_replace_are_protected(tmp_path: Path) -> None:
     fill(tmp_path / "out", "old")
     inside, out = str(tmp_path / "out" / "deep"), str(tmp_path / "out")
@@ -297,14 +284,17 @@ def test_a_disk_that_is_full_elsewhere_is_not_said_to_be_full_here(tmp_path: Pat
         write_and_raise(tmp_path / "out", InputError(f"/elsewhere/b: cannot be written: {words}"))
 
 
-def test_a_mount_point_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_that_cannot_take_results_is_refused_before_the_work(tmp_path, monkeypatch):
+    def refused(path: Path, problem: str) -> None:
+        with pytest.raises(InputError, match=problem), output_folder(path):
+            raise AssertionError("the block must not begin")
+
+    refused(tmp_path / ("x" * 300), "cannot write here: File name too long")
+    fill(tmp_path / ("ü" * 127), "x")
+    assert names(tmp_path) == ["ü" * 127]
     (tmp_path / "volume").mkdir()
     monkeypatch.setattr(os.path, "ismount", lambda path: Path(path).name == "volume")
-    with (
-        pytest.raises(InputError, match="volume: is a mount point.*give a folder in it"),
-        output_folder(tmp_path / "volume"),
-    ):
-        raise AssertionError("the block must not begin")
+    refused(tmp_path / "volume", "volume: is a mount point.*give a folder in it")
     fill(tmp_path / "volume" / "out", "x")
 
 

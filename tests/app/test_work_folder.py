@@ -45,9 +45,7 @@ def test_state_is_kept_when_a_run_is_cut_off_and_goes_when_it_ends(tmp_path: Pat
 
 
 @pytest.mark.parametrize("anew", [True, False])
-def test_a_state_that_a_kill_left_half_removed_is_not_continued(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, anew: bool
-) -> None:
+def test_a_state_that_a_kill_left_half_removed_is_not_continued(tmp_path, monkeypatch, anew):
     """A run is killed while it removes its state: as it begins anew, or once its results are written."""
 
     class Killed(BaseException):
@@ -81,9 +79,7 @@ def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("message", "noted"), [("no labels", True), ("{path} has other settings", False)])
-def test_an_error_that_is_not_about_the_state_says_that_it_can_be_continued(
-    tmp_path: Path, message: str, *, noted: bool
-) -> None:
+def test_an_error_that_is_not_about_the_state_says_that_it_can_be_continued(tmp_path, message, noted):
     path = tmp_path / "run"
 
     def fail() -> None:
@@ -149,9 +145,7 @@ def test_what_cannot_be_removed_is_said(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("taken", [True, False])
-def test_an_error_before_anything_was_computed_speaks_of_no_state_and_leaves_none(
-    tmp_path: Path, *, taken: bool
-) -> None:
+def test_an_error_before_anything_was_computed_speaks_of_no_state_and_leaves_none(tmp_path, taken):
     path = tmp_path / "run"
     if not taken:
         cut_off(path, "state of another run")

@@ -101,10 +101,6 @@ def test_scenes_without_gaussians_or_true_objects_are_refused() -> None:
     scene = laid_out()
     with pytest.raises(InputError, match="scene made has no Gaussians"):
         labeled_points(replace(scene, gaussians=None))
-    for broken in (
-        replace(scene, views=None),
-        replace(scene, objects=()),
-        replace(scene, views=replace(scene.views, instances=None)),
-    ):
+    for lost in ({"views": None}, {"objects": ()}, {"views": replace(scene.views, instances=None)}):
         with pytest.raises(InputError, match="has no true objects: expected a labeled mesh"):
-            labeled_points(broken)
+            labeled_points(replace(scene, **lost))

@@ -250,9 +250,6 @@ def test_boxes_of_sentences_are_reported_by_kind_threshold_and_number(tmp_path: 
     )
 
 
-# Defaults
-
-
 # Texts
 
 

@@ -23,7 +23,6 @@ def test_choices_are_those_that_occur_in_the_scene() -> None:
 def walls(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[TrainingScene], OutputSpaces, np.ndarray]:
     dataset, names = prepared(tmp_path_factory.mktemp("prepared"), count=2)
     outputs, codebook = dataset.load_space()
-    assert codebook is not None
     return (
         [TrainingScene([scene]) for scene in dataset.scenes(names)],
         OutputSpaces(by_teacher={"sides": outputs}),

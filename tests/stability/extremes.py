@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from splats import random_gaussians, random_rotation
+from splats import front_camera, random_gaussians, random_rotation
 
 from gsencoder.types import Cameras, Gaussians
 
@@ -56,13 +56,8 @@ class Extreme:
 
 
 def camera(width: int = 24, height: int = 16, focal: float = 20.0, pose: np.ndarray | None = None) -> Cameras:
-    pose = np.eye(4) if pose is None else pose
-    return Cameras(
-        cam_from_world=pose[None].astype(np.float32),
-        Ks=np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], np.float32),
-        widths=np.array([width], np.int32),
-        heights=np.array([height], np.int32),
-    )
+    made = front_camera(width, height, focal)
+    return made if pose is None else replace(made, cam_from_world=pose[None].astype(np.float32))
 
 
 def vectors_of(n: int, norm: float = 1.0, rank: int = CHANNELS, mean: float = 0.3) -> np.ndarray:

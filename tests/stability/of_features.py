@@ -21,7 +21,7 @@ from gsencoder.infer.relevancy import GaussianProducts, relevancy
 from gsencoder.memory.attention import MemoryAttention
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.train.losses import LossConfig, contrast_loss, match_loss, render_loss
-from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, MemoryBank, QueryMemory, Scene
+from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory, Scene
 
 Wide = oracles.Wide
 SPACE = FeatureSpace(name="s", channels=CHANNELS)
@@ -281,13 +281,10 @@ def package_error(case: Case) -> float:
 def folder_error(case: Case) -> float:
     features = features_of(case)
     with tempfile.TemporaryDirectory() as folder:
-        save_features(Path(folder) / "f", Scene(name="s", gaussians=_as_many(case)), features, {"teacher": "t"})
+        gaussians = case.gaussians.select(np.zeros(len(case.vectors), np.int64))
+        save_features(Path(folder) / "f", Scene(name="s", gaussians=gaussians), features, {"teacher": "t"})
         (back,) = load_features(Path(folder) / "f").features.values()
         return worst(back.features.copy(), features.features, np.abs(features.features).max(axis=0))
-
-
-def _as_many(case: Case) -> Gaussians:
-    return case.gaussians.select(np.zeros(len(case.vectors), np.int64))
 
 
 @routine("maps as float16 files", "vectors")
@@ -297,7 +294,6 @@ def map_error(case: Case) -> float:
         made = FeatureMap(features=vectors, grid_from_image=np.eye(2, 3), space=SPACE)
         write_map(Path(folder) / "m", made)
         back = read_map(Path(folder) / "m", SPACE)
-        assert back.features is not None
         return worst(back.features, vectors, np.abs(vectors).max(axis=(0, 1)))
 
 

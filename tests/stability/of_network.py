@@ -220,10 +220,6 @@ def encoder_error(case: Case, made: GaussianEncoder, autocast: bool = False) -> 
     return float((got - want).square().mean().sqrt() / want.square().mean().sqrt())
 
 
-RELATIVE = "root mean square error of the outputs of a small random encoder, relative to these"
-ORACLE = "the same network in float64, on the same inputs"
-
-
 @routine("encoder in float32", "splat")
 def float32_error(case: Case) -> float:
     return encoder_error(case, network_of(torch.float32))

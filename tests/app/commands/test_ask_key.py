@@ -57,14 +57,7 @@ def echo(status: int, spelling: str, form: str) -> Any:
 
 
 @pytest.mark.parametrize(("many", "debug"), [(False, ("--debug",)), (True, ())])
-def test_a_key_that_a_server_repeats_reaches_neither_disk_nor_screen(
-    features: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    many: bool,
-    debug: tuple[str, ...],
-) -> None:
+def test_a_key_that_a_server_repeats_reaches_no_disk_or_screen(features, tmp_path, monkeypatch, capsys, many, debug):
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     (tmp_path / "q.jsonl").write_text('{"question": "Where is the cube?"}\n{"question": "the left one"}\n')
     question = f"questions={tmp_path / 'q.jsonl'}" if many else "question=Where is the cube?"

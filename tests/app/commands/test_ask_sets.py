@@ -78,9 +78,8 @@ def test_answers_of_a_set_are_those_of_its_questions_and_a_dry_run_sends_nothing
     assert {row["question_id"]: row["answer_top10"] for row in predicted} == {
         key: [texts[each.situated_text]] for key, each in questions.items()
     }
-    assert len(read_answer_predictions(tmp_path / "out" / "predictions.json", list(questions.values()))) == len(
-        questions
-    )
+    read = read_answer_predictions(tmp_path / "out" / "predictions.json", list(questions.values()))
+    assert len(read) == len(questions)
     results = results_of(tmp_path / "out")
     assert results["answered"] == results["predicted"] == len(questions)
     assert set(results["scenes"]) == set(ROOMS)

@@ -48,7 +48,6 @@ def test_training_states_what_the_basis_keeps_of_its_scenes_and_of_held_out_ones
     assert made_by["basis"] == figures
     assert (figures["rank"], figures["energy_kept"]) == (3, outputs.basis.energy_kept)
     views = load_scene(folder / "room_1").views
-    assert views is not None
     direct = project_maps(outputs.basis, PaletteTeacher(PaletteConfig()), views, range(len(views))).fit()
     assert {name: figures[name] for name in direct.figures()} == pytest.approx(direct.figures(), abs=1e-3)
 

@@ -151,9 +151,7 @@ def test_teachers_can_be_optimized_one_by_one_or_not_at_all(room, teachers, tmp_
     assert 0.5 < fits["none"] < fits["turns"]
 
 
-def test_a_memory_of_predictions_has_their_mean_and_all_gaussians_without_any_fusion(
-    room: Path, teachers: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_memory_of_predictions_has_their_mean_and_all_gaussians(room, teachers, tmp_path, capsys, monkeypatch):
     weights = tmp_path / "encoder.safetensors"
     mean = np.linspace(0.05, 0.15, 11, dtype=np.float32)
     outputs = OutputSpace(space=PaletteTeacher(PaletteConfig()).space, mean=mean, scale=0.3)

@@ -25,7 +25,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_room(made, folder)
     write_words(folder / "words.safetensors", made)
     views = load_scene(folder).views
-    assert views.instances is not None
     for name, labels in zip(views.names, views.instances, strict=True):
         (folder / "masks").mkdir(exist_ok=True)
         np.save(folder / "masks" / Path(name).with_suffix(".npy").name, labels)

@@ -39,14 +39,11 @@ def test_labels_read_back_with_names_counts_and_boxes(written: Path) -> None:
     assert made.names[0].aabb_min is None
     for each in made.names[1:]:
         members = SCENE.gaussians.means[np.flatnonzero(each.label == LABELS)] + SCENE.origin
-        assert each.aabb_min is not None
-        assert each.aabb_max is not None
         assert np.allclose(each.aabb_min, members.min(axis=0), atol=1e-6)
         assert np.allclose(each.aabb_max, members.max(axis=0), atol=1e-6)
 
 
 def test_the_labeled_splat_is_a_splat_for_every_other_reader(written: Path) -> None:
-    assert SCENE.gaussians is not None
     save_splat(written / "plain.ply", SCENE.gaussians, origin=SCENE.origin)
     plain, labeled = (load_splat(written / name, origin=SCENE.origin) for name in ("plain.ply", LABELS_PLY))
     for name in ("means", "quats", "scales", "opacities", "sh"):
@@ -82,7 +79,6 @@ def test_words_without_gaussians_have_a_count_of_zero_and_no_box(tmp_path: Path)
 
 
 def test_missing_files_and_properties_are_refused(written: Path) -> None:
-    assert SCENE.gaussians is not None
     save_splat(written / LABELS_PLY, SCENE.gaussians, origin=SCENE.origin)
     with pytest.raises(InputError, match="has no property 'label'"):
         load_property(written / LABELS_PLY, "label")

@@ -112,12 +112,6 @@ OBJECTS = tuple(
 CORNERS = box_corners((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
 
 
-def written_captions(folder: Path, content: Any) -> Path:
-    path = folder / "pred.json"
-    path.write_text(json.dumps(content))
-    return path
-
-
 def row(**changes: Any) -> dict[str, Any]:
     return {"caption": "sos a chair eos", "box": CORNERS, "sem_prob": [0.5, 0.5], "obj_prob": [0.25, 0.75]} | changes
 
@@ -126,13 +120,13 @@ def test_captions_of_boxes_are_read_as_the_benchmark_takes_them(tmp_path: Path) 
     content = {"s0": [row(), {"caption": "", "box": CORNERS[::-1]}], "s1": []}
     aabb = ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
     expected = {"s0": [("sos a chair eos", aabb), ("", aabb)]}
-    assert read_caption_predictions(written_captions(tmp_path, content), OBJECTS) == (expected, {})
+    assert read_caption_predictions(written(tmp_path, content), OBJECTS) == (expected, {})
 
 
 def test_captions_of_given_objects_are_read_as_scan2cap_writes_them(tmp_path: Path) -> None:
-    path = written_captions(tmp_path, {"s0|3|office_chair": ["sos a chair eos"], "s1|3": ["b"]})
+    path = written(tmp_path, {"s0|3|office_chair": ["sos a chair eos"], "s1|3": ["b"]})
     assert read_caption_predictions(path, OBJECTS) == ({}, {("s0", 3): "sos a chair eos", ("s1", 3): "b"})
-    assert read_caption_predictions(written_captions(tmp_path, {}), OBJECTS) == ({}, {})
+    assert read_caption_predictions(written(tmp_path, {}), OBJECTS) == ({}, {})
 
 
 @pytest.mark.parametrize(
@@ -149,7 +143,7 @@ def test_captions_of_given_objects_are_read_as_scan2cap_writes_them(tmp_path: Pa
 )
 def test_a_wrong_entry_of_captions_is_named(tmp_path: Path, content: Any, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
-        read_caption_predictions(written_captions(tmp_path, content), OBJECTS)
+        read_caption_predictions(written(tmp_path, content), OBJECTS)
     assert "pred.json" in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -61,7 +61,6 @@ def test_the_reason_for_going_without_java_is_named(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(java_metrics.shutil, "which", lambda name: "/usr/bin/java")
     monkeypatch.setattr(java_metrics, "find_spec", lambda name: None)
     assert "pycocoevalcap is not installed" in str(find_java_tools())
-    monkeypatch.setattr(java_metrics, "PACKAGE", "json")
     monkeypatch.undo()
     monkeypatch.setattr(java_metrics.shutil, "which", lambda name: "/usr/bin/java")
     monkeypatch.setattr(java_metrics, "PACKAGE", "json")
@@ -109,12 +108,10 @@ def test_the_tokenizer_gets_texts_that_are_none_and_tokens_lose_punctuation(tmp_
 
 
 def test_options_for_java_of_the_environment_do_not_reach_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    java = tmp_path / "java"
-    java.write_text(f"#!{sys.executable}\nimport os\nprint(os.environ.get('JAVA_TOOL_OPTIONS'), os.environ['KEPT'])\n")
-    java.chmod(java.stat().st_mode | stat.S_IXUSR)
+    program = "import os\nprint(os.environ.get('JAVA_TOOL_OPTIONS'), os.environ['KEPT'])\n"
     for name in ("JAVA_TOOL_OPTIONS", "_JAVA_OPTIONS", "KEPT"):
         monkeypatch.setenv(name, "x")
-    assert ptb_tokens(["a"], JavaTools(java=str(java), folder=tmp_path)) == ["None x"]
+    assert ptb_tokens(["a"], stand_in(tmp_path, program)) == ["None x"]
 
 
 @pytest.mark.slow
