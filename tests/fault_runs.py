@@ -110,7 +110,6 @@ class FaultServer:
         action: int = COUNT,
         reads: Path | None = None,
         warm: bool = False,
-        environment: dict[str, str] | None = None,
         meanwhile: list[str] | None = None,
     ) -> Run:
         """Runs a command line in a child.
@@ -130,7 +129,7 @@ class FaultServer:
         asked = {
             "words": words, "folder": str(folder), "writes": "" if reads else str(folder), "reads": str(reads or ""),
             "at": at, "action": action, "trace": str(trace), "log": str(side / "log"), "warm": warm,
-            "environment": environment or {}, "meanwhile": meanwhile or [], "log of the other": str(side / "other"),
+            "meanwhile": meanwhile or [], "log of the other": str(side / "other"),
         }  # fmt: skip
         for name in ("log", "other"):
             (side / name).unlink(missing_ok=True)
@@ -248,7 +247,6 @@ def forked(asked: dict[str, Any]) -> int:
         streams = os.open(asked["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(streams, 1)
         os.dup2(streams, 2)
-        os.environ.update(asked.get("environment", {}))
         os.chdir(asked["folder"])
         writes, reads, trace = (os.fsencode(asked[name]) for name in ("writes", "reads", "trace"))
         at, action = ctypes.c_long(asked["at"]), ctypes.c_int(asked["action"])
@@ -320,7 +318,6 @@ def main() -> None:
             answer = {"seconds": time.perf_counter() - began}
         elif asked["warm"]:
             # Its modules and kernels are then those of all children.
-            os.environ.update(asked["environment"])
             os.chdir(asked["folder"])
             from gsencoder.app import main as cli
 

@@ -76,10 +76,9 @@ def write_colmap_text(
     *,
     camera: str | Sequence[str] = CAMERA,
     poses: Sequence[np.ndarray] | None = None,
-    blank_lines: bool = True,
     names: Sequence[str] | None = None,
 ) -> Path:
-    """Writes sparse/0 as text, without points; `blank_lines` stand where the matches of an image would.
+    """Writes sparse/0 as text, without points; blank lines stand where the matches of an image would.
 
     `camera` is that of all images, or one an image.
     """
@@ -95,8 +94,7 @@ def write_colmap_text(
         name = names[i] if names else Path(frame["file_path"]).name
         number = min(i + 1, len(cameras))
         lines.append(" ".join(map(str, [i + 1, *quat, *pose[:3, 3], number, name])))
-        if blank_lines:
-            lines.append("")
+        lines.append("")
     (sparse / "images.txt").write_text("\n".join(lines) + "\n")
     return folder
 

@@ -92,7 +92,7 @@ def write_scannetpp_labels(
     return folder
 
 
-def scanned(scene: Scene, *, step: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def scanned(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A mesh of what the views of a room see: vertices in the world, triangles, and the object of each vertex.
 
     Pixels are vertices, and neighbors at nearly one depth are joined.
@@ -100,22 +100,20 @@ def scanned(scene: Scene, *, step: int = 1) -> tuple[np.ndarray, np.ndarray, np.
     views = scene.views
     vertices, faces, instances, count = [], [], [], 0
     for view in range(len(views)):
-        depth = views.depths[view][::step, ::step].astype(np.float64)
-        labels = views.instances[view][::step, ::step]
+        depth = views.depths[view].astype(np.float64)
         h, w = depth.shape
-        u, v = np.meshgrid(np.arange(w) * step + 0.5, np.arange(h) * step + 0.5)
+        u, v = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
         points = views.cameras.unproject(np.stack([u, v], axis=-1), depth, view) + scene.origin
         numbers = np.arange(h * w).reshape(h, w)
-        quads = np.stack([numbers[:-1, :-1], numbers[:-1, 1:], numbers[1:, 1:], numbers[1:, :-1]], axis=-1).reshape(
-            -1, 4
-        )
+        corners = (numbers[:-1, :-1], numbers[:-1, 1:], numbers[1:, 1:], numbers[1:, :-1])
+        quads = np.stack(corners, axis=-1).reshape(-1, 4)
         near = depth.ravel()[quads]
         quads = quads[(near.min(axis=1) > 0) & (np.ptp(near, axis=1) < 0.05 * near.min(axis=1))]
         vertices.append(points.reshape(-1, 3))
-        instances.append(labels.ravel())
+        instances.append(views.instances[view].ravel())
         faces.append(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]) + count)
         count += h * w
-    seen = np.concatenate([(views.depths[view][::step, ::step] > 0).ravel() for view in range(len(views))])
+    seen = np.concatenate([(views.depths[view] > 0).ravel() for view in range(len(views))])
     row = np.cumsum(seen) - 1
     return (
         np.concatenate(vertices)[seen].astype(np.float32),
@@ -129,7 +127,7 @@ def names_of_room(scene: Scene) -> dict[int, str]:
     return {thing.id: thing.name or ROOM_NAMES.get(thing.id, "unknown") for thing in scene.objects}
 
 
-def write_scannet_scan(scene: Scene, folder: Path, *, alignment: np.ndarray | None = None) -> Path:
+def write_scannet_scan(scene: Scene, folder: Path) -> Path:
     """A room as a ScanNet scan: exported frames, and labels whose objectId + 1 is the value in the instance maps."""
     vertices, faces, instances = scanned(scene)
     # Three segments an object, numbered like vertices: not from 0, and with gaps.
@@ -140,7 +138,7 @@ def write_scannet_scan(scene: Scene, folder: Path, *, alignment: np.ndarray | No
         for number in np.unique(instances[instances > 0]).tolist()
     ]
     write_scannet_frames(scene, folder)
-    return write_scannet_labels(folder, folder.name, vertices, segments, groups, faces=faces, alignment=alignment)
+    return write_scannet_labels(folder, folder.name, vertices, segments, groups, faces=faces)
 
 
 def write_scannetpp_scan(scene: Scene, folder: Path) -> Path:

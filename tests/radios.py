@@ -23,8 +23,6 @@ def small_radio(
     spatial_version: str | None = None,
     inner: int = 2,
     pre_norm: bool = False,
-    hidden: int = 24,
-    spread: float = 0.2,
     teachers: Any = TEACHERS,
 ) -> Path:
     """A folder as NVlabs' releases are: backbone and heads in one safetensors file, config.json with `args`,
@@ -35,14 +33,14 @@ def small_radio(
 
     torch.manual_seed(seed)
     with torch.no_grad():
-        model = transformers.RadioModel(transformers.RadioConfig(**{**SMALL, "hidden_size": hidden}))
+        model = transformers.RadioModel(transformers.RadioConfig(**SMALL))
         for parameter in model.parameters():
-            parameter.add_(torch.randn_like(parameter) * spread)
+            parameter.add_(torch.randn_like(parameter) * 0.2)
     model.save_pretrained(folder)
     weights = load_file(folder / "model.safetensors")
     configs = {}
     for index, (name, outputs) in enumerate(OUTPUTS.items()):
-        sizes = {"input_dim": hidden, "hidden_dim": 20, "output_dim": outputs, "num_inner": inner}
+        sizes = {"input_dim": SMALL["hidden_size"], "hidden_dim": 20, "output_dim": outputs, "num_inner": inner}
         configs[name] = {"head_idx": index, "summary": sizes, "feature": sizes}
         for module, form in (("head_mlp", version), ("feat_mlp", spatial_version or version)):
             weights |= head_weights(f"radio_model.adaptors.{name}.{module}.", form, sizes, pre_norm)

@@ -1,7 +1,6 @@
 """A small scene with label images in a folder, that tests of `teacher=regions` stand on."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,19 +29,19 @@ def labels_of(view: int) -> np.ndarray:
     return labels
 
 
-def write_masks(folder: Path, names: Sequence[str] = ("a", "b")) -> Path:
-    for view, name in enumerate(names):
+def write_masks(folder: Path) -> Path:
+    for view, name in enumerate("ab"):
         save(folder / f"{name}.png", labels_of(view))
     return folder
 
 
-def region_scene(folder: Path | None = None, *, names: Sequence[str] = NAMES, **views: Any) -> Scene:
+def region_scene(folder: Path | None = None, **views: Any) -> Scene:
     """Two views of a ball of Gaussians, with random photographs."""
     cameras, rng = front_camera(WIDTH, HEIGHT, 30.0).select([0, 0]), np.random.default_rng(0)
     images = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(2)]
     fields = {"images": images, **views}
     return Scene(
-        name="s", gaussians=random_gaussians(150), views=Views(cameras=cameras, names=tuple(names), **fields),
+        name="s", gaussians=random_gaussians(150), views=Views(cameras=cameras, names=NAMES, **fields),
         folder=folder,
     )  # fmt: skip
 

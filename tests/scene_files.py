@@ -79,7 +79,6 @@ def write_colmap(
     params: tuple[float, ...] = (30, 31, 16, 12),
     text: bool = False,
     old: bool = False,
-    where: str = "sparse/0",
     offset: tuple[float, float, float] = (0, 0, 0),
 ) -> Path:
     """A COLMAP scene with five points that every 32×24 picture sees; `old` leaves rigs and frames away."""
@@ -103,7 +102,7 @@ def write_colmap(
         for i in range(1, count + 1):
             track.add_element(i, j)
         made.add_point3D(point, track, np.array([10 * j, 20, 30], np.uint8))
-    sparse = folder / where
+    sparse = folder / "sparse/0"
     sparse.mkdir(parents=True, exist_ok=True)
     (made.write_text if text else made.write_binary)(str(sparse))
     if old:

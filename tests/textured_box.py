@@ -75,15 +75,15 @@ def box_views(cameras: Cameras | None = None, *, color_cameras: Cameras | None =
     )
 
 
-def write_box(folder: Path, views: Views, *, millimeters: float = 1000.0) -> dict[str, Any]:
-    """Writes views as a nerfstudio scene, 16-bit depth in steps of 1 / `millimeters`; returns its transforms.json."""
+def write_box(folder: Path, views: Views) -> dict[str, Any]:
+    """Writes views as a nerfstudio scene, 16-bit depth in millimetres; returns its transforms.json."""
     for name in ("images", "depth"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     frames = []
     for view, pose in enumerate(views.cameras.world_from_cam @ OPENCV_FROM_OPENGL):
         stem = f"{view:03d}.png"
         Image.fromarray(views.images[view]).save(folder / "images" / stem)
-        steps = np.round(views.depths[view].astype(np.float64) * millimeters).astype(np.uint16)
+        steps = np.round(views.depths[view].astype(np.float64) * 1000).astype(np.uint16)
         Image.fromarray(steps).save(folder / "depth" / stem)
         frames.append(
             {"file_path": f"images/{stem}", "depth_file_path": f"depth/{stem}", "transform_matrix": pose.tolist()}
@@ -91,7 +91,7 @@ def write_box(folder: Path, views: Views, *, millimeters: float = 1000.0) -> dic
     K = views.cameras.Ks[0].astype(float)
     content = {
         "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2],
-        "depth_unit_scale_factor": 1 / millimeters, "frames": frames,
+        "depth_unit_scale_factor": 1 / 1000, "frames": frames,
     }  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
     return content

@@ -15,7 +15,7 @@ def run(path: Path, inside: Callable[[Path], None] = lambda path: None, *, anew:
         inside(work.path)
 
 
-def cut_off(path: Path, *names: str, anew: bool = False) -> list[str]:
+def cut_off(path: Path, *names: str) -> list[str]:
     """Leaves what a run leaves that was stopped after it had written these files; what it had found there."""
     names_before = []
 
@@ -26,7 +26,7 @@ def cut_off(path: Path, *names: str, anew: bool = False) -> list[str]:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(path, inside, anew=anew)
+        run(path, inside)
     return names_before
 
 

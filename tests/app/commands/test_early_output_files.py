@@ -7,12 +7,14 @@ from typing import Any
 
 import pytest
 from command_runs import refusal
+from named_rooms import write_words
 from splats import random_gaussians
 from viewed_rooms import STUB
 
 from gsencoder.app import main as cli
-from gsencoder.app.commands import export, repair, view
+from gsencoder.app.commands import evaluate, export, repair, view
 from gsencoder.data.splats.files import save_splat
+from gsencoder.data.synthetic import make_room, write_room
 
 COMMANDS = {
     "view": (["view", "features"], "page.html"),
@@ -72,3 +74,57 @@ def test_a_file_that_can_be_written_is_left_as_it_was_until_the_results_are_ther
     with pytest.raises(AssertionError, match="the work was begun"):
         cli.main([*words, f"out=results/{file}", "overwrite=true", "quiet=true"])
     assert [(each.name, each.read_text()) for each in (tmp_path / "results").iterdir()] == [(file, "earlier")]
+
+
+# Names in the settings of `evaluate` that are none are refused before features are computed
+
+
+@pytest.fixture
+def evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A room and its words; that features are computed is a fault here."""
+    made = make_room(0, objects=3, views=3, width=60, height=45)
+    write_room(made, tmp_path / "room")
+    write_words(tmp_path / "words.safetensors", made)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("features are computed")
+
+    monkeypatch.setattr(evaluate, "fusion_source", lambda *_, **__: refuse)
+    return tmp_path
+
+
+def refused(capsys: pytest.CaptureFixture[str], evaluated: Path, *options: str) -> str:
+    words = f"teacher.words={evaluated / 'words.safetensors'}"
+    return refusal(capsys, "evaluate", str(evaluated / "room"), words, f"out={evaluated / 'out'}", *options)
+
+
+def test_a_class_that_the_words_do_not_know(evaluated: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (evaluated / "classes.csv").write_text("id,name\n1,wall\n2,xylophone\n")
+    for protocol in ("semantics", "instances", "recognition"):
+        line = refused(capsys, evaluated, f"protocol={protocol}", f"classes={evaluated / 'classes.csv'}")
+        assert "xylophone" in line
+        assert "give words that know all classes, or the classes that they know as classes=FILE" in line
+
+
+def test_a_word_that_may_be_absent_and_that_no_table_knows(evaluated: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(capsys, evaluated, "protocol=absent", "protocol.vocabulary=[wall,xylophone]")
+    assert "error: protocol.vocabulary: not among the " in line
+    assert "xylophone" in line
+
+
+def test_sentences_about_other_scenes_alone(evaluated: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (evaluated / "ScanRefer.json").write_text(
+        '[{"scene_id": "scene0000_00", "object_id": "1", "object_name": "bed", "ann_id": "0", "description": "a bed", '
+        '"token": ["a", "bed"]}]'
+    )
+    line = refused(capsys, evaluated, "protocol=referring", f"protocol.expressions={evaluated / 'ScanRefer.json'}")
+    assert "none of the 1 sentences of " in line
+    assert "is about a scene that is evaluated (room); first scene0000_00" in line
+
+
+def test_two_scenes_of_one_name(evaluated: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make_room(1, objects=3, views=3, width=60, height=45)
+    write_room(made, evaluated / "other" / "room")
+    for protocol in ("semantics", "localization"):
+        line = refused(capsys, evaluated, str(evaluated / "other" / "room"), f"protocol={protocol}")
+        assert "are both called 'room'" in line

@@ -3,7 +3,6 @@
 import math
 import sys
 from types import ModuleType
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -28,10 +27,8 @@ def singular(word: str) -> str:
     return word.removesuffix("s")
 
 
-def question(
-    name: str, *answers: str, scene: str = "s0", text: str = "What?", dataset: Literal["scanqa", "sqa3d"] = "sqa3d"
-) -> Question:
-    return Question(dataset=dataset, id=name, scene=scene, text=text, answers=answers)
+def question(name: str, *answers: str) -> Question:
+    return Question(dataset="sqa3d", id=name, scene="s0", text="What?", answers=answers)
 
 
 @pytest.mark.parametrize(

@@ -32,15 +32,14 @@ def part(share: float) -> np.ndarray:
     return np.array([[0.0, 0, 0], [1, 1, share]])
 
 
-def truth(number: int, multiple: bool | None = False, others: bool | None = False, box: bool = True) -> Expression:
-    aabb = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)) if box else None
+def truth(number: int, multiple: bool | None = False, others: bool | None = False) -> Expression:
+    aabb = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     return replace(expression(number, "x"), multiple=multiple, others=others, aabb=aabb)
 
 
-def found(number: int, *boxes: np.ndarray, scene: str = "a") -> PredictedBoxes:
-    return PredictedBoxes(
-        scene=scene, object_id=number, annotation="0", boxes=np.array(boxes, np.float64).reshape(-1, 2, 3)
-    )
+def found(number: int, *boxes: np.ndarray) -> PredictedBoxes:
+    rows = np.array(boxes, np.float64).reshape(-1, 2, 3)
+    return PredictedBoxes(scene="a", object_id=number, annotation="0", boxes=rows)
 
 
 def test_the_iou_has_scanrefers_epsilon() -> None:
