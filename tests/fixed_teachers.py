@@ -30,11 +30,8 @@ class FixedTeacher:
         self.calls += 1
         if view == self.fail_at:
             raise KeyboardInterrupt
-        return FeatureMap(
-            features=self.maps[view],
-            grid_from_image=np.array([[1 / self.stride, 0, 0], [0, 1 / self.stride, 0]]),
-            space=SPACE,
-        )
+        grid = np.array([[1 / self.stride, 0, 0], [0, 1 / self.stride, 0]])
+        return FeatureMap(features=self.maps[view], grid_from_image=grid, space=SPACE)
 
     def settings(self) -> dict[str, Any]:
         return {"name": "fixed"}
@@ -62,9 +59,5 @@ def ring(count: int = 5, width: int = 32, height: int = 24) -> Cameras:
 
 
 def make_scene(n: int = 150, count: int = 5, gaussians: Gaussians | None = None, **views: Any) -> Scene:
-    cameras = ring(count)
-    return Scene(
-        name="test",
-        gaussians=random_gaussians(n) if gaussians is None else gaussians,
-        views=Views(cameras=cameras, names=tuple(f"v{i}" for i in range(count)), **views),
-    )
+    all_views = Views(cameras=ring(count), names=tuple(f"v{i}" for i in range(count)), **views)
+    return Scene(name="test", gaussians=random_gaussians(n) if gaussians is None else gaussians, views=all_views)

@@ -115,11 +115,8 @@ def scanned(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         count += h * w
     seen = np.concatenate([(views.depths[view] > 0).ravel() for view in range(len(views))])
     row = np.cumsum(seen) - 1
-    return (
-        np.concatenate(vertices)[seen].astype(np.float32),
-        row[np.concatenate(faces)].astype(np.int32),
-        np.concatenate(instances)[seen].astype(np.int32),
-    )
+    triangles, numbers = row[np.concatenate(faces)].astype(np.int32), np.concatenate(instances)[seen].astype(np.int32)
+    return np.concatenate(vertices)[seen].astype(np.float32), triangles, numbers
 
 
 def names_of_room(scene: Scene) -> dict[int, str]:

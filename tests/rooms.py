@@ -74,11 +74,6 @@ def room(
     scales = np.full(len(means), 0.6 * STEP)
     scales[: len(target)] = 0.018
     scales[len(target) : len(target) + len(around)] = 0.6 * step
-    scene = Scene(
-        name="room",
-        gaussians=splat(means, scales),
-        views=Views(cameras=cameras, names=tuple(f"frame {number:02d}" for number in range(len(cameras)))),
-        up=UP,
-        metres_per_unit=1.0,
-    )
+    views = Views(cameras=cameras, names=tuple(f"frame {number:02d}" for number in range(len(cameras))))
+    scene = Scene(name="room", gaussians=splat(means, scales), views=views, up=UP, metres_per_unit=1.0)
     return scene, np.arange(len(target))

@@ -101,9 +101,7 @@ def read_labels(folder: Path) -> SimpleNamespace:
     """The splat, the label of each Gaussian, and what the labels stand for, of the files of `select`."""
     content = json.loads((folder / LABELS_JSON).read_text())
     origin = np.array(content["origin"])
-    return SimpleNamespace(
-        gaussians=load_splat(folder / LABELS_PLY, origin=origin),
-        labels=load_property(folder / LABELS_PLY, PROPERTY).astype(np.int32),
-        origin=origin,
-        names=[SimpleNamespace(**row) for row in content["labels"]],
-    )
+    gaussians = load_splat(folder / LABELS_PLY, origin=origin)
+    labels = load_property(folder / LABELS_PLY, PROPERTY).astype(np.int32)
+    names = [SimpleNamespace(**row) for row in content["labels"]]
+    return SimpleNamespace(gaussians=gaussians, labels=labels, origin=origin, names=names)

@@ -35,21 +35,14 @@ def save_graph(
     """A graph that looks each token up in a table; with the output "sentence_embedding" it gives the sum of them."""
     table = np.random.default_rng(0).normal(size=(rows, CHANNELS)).astype(np.float32) * np.float32(scale)
     nodes = [helper.make_node("Gather", ["table", "input_ids"], ["tokens"])]
-    pooled = output == "sentence_embedding"
-    nodes += [
-        helper.make_node("ReduceSum", ["tokens", "axes"], [output], keepdims=0)
-        if pooled
-        else helper.make_node("Identity", ["tokens"], [output])
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "text",
-        [
-            helper.make_tensor_value_info(name, TensorProto.INT64, ["batch", length])
-            for name in ("input_ids", *["attention_mask"] * mask)
-        ],
-        [helper.make_tensor_value_info(output, TensorProto.FLOAT, None)],
-        [numpy_helper.from_array(table, "table"), numpy_helper.from_array(np.array([1]), "axes")],
-    )
+    if output == "sentence_embedding":
+        nodes.append(helper.make_node("ReduceSum", ["tokens", "axes"], [output], keepdims=0))
+    else:
+        nodes.append(helper.make_node("Identity", ["tokens"], [output]))
+    names = ("input_ids", *["attention_mask"] * mask)
+    inputs = [helper.make_tensor_value_info(name, TensorProto.INT64, ["batch", length]) for name in names]
+    outputs = [helper.make_tensor_value_info(output, TensorProto.FLOAT, None)]
+    constants = [numpy_helper.from_array(table, "table"), numpy_helper.from_array(np.array([1]), "axes")]
+    graph = helper.make_graph(nodes, "text", inputs, outputs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
     onnx.save(model, path)

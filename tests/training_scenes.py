@@ -105,13 +105,10 @@ def prepared(folder: Path, *, count: int = 3, teacher: Teacher | None = None) ->
 def samples(dataset: PreparedDataset, names: Sequence[str], **changes: Any) -> SampleDataset:
     """Samples of prepared scenes."""
     recipe = {
-        "encoder": SMALL,
-        "sampling": SamplingConfig(views=2, gaussians=200),
-        "augmentation": Augmentation(turn=10.0),
-        "losses": LOSSES,
+        "encoder": SMALL, "sampling": SamplingConfig(views=2, gaussians=200), "losses": LOSSES,
+        "augmentation": Augmentation(turn=10.0), "seed": 3,
         "teachers": (TeacherRecipe(name="sides", class_balance=dataset.load_class_balance()),),
-        "seed": 3,
-    }
+    }  # fmt: skip
     scenes = [TrainingScene([scene]) for scene in dataset.scenes(names)]
     return SampleDataset(scenes, SampleRecipe(**{**recipe, **changes}))
 

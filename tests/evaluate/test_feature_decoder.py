@@ -67,9 +67,9 @@ def tower_of(decoder: FeatureDecoder, inputs: dict[str, Any]) -> torch.Tensor:
         return decoder.model.model.vision_model(inputs["pixel_values"][0]).last_hidden_state
 
 
-def own_answer(decoder: FeatureDecoder, inputs: dict[str, Any], count: int = 12) -> torch.Tensor:
+def own_answer(decoder: FeatureDecoder, inputs: dict[str, Any]) -> torch.Tensor:
     with torch.inference_mode():
-        ids = decoder.model.generate(**inputs, max_new_tokens=count, do_sample=False)
+        ids = decoder.model.generate(**inputs, max_new_tokens=12, do_sample=False)
     return ids[:, inputs["input_ids"].shape[1] :]
 
 
@@ -129,12 +129,11 @@ def test_other_models_take_their_towers_features_too(kind: str) -> None:
         token_inputs = {"input_ids": ids, "attention_mask": torch.ones_like(ids)}
         if kind in ("paligemma", "gemma3"):
             token_inputs["token_type_ids"] = (ids == 3).long()
-        own, *others = (
-            model.generate(**token_inputs, pixel_values=each[None], max_new_tokens=10, do_sample=False)[
-                :, ids.shape[1] :
-            ]
+        said = (
+            model.generate(**token_inputs, pixel_values=each[None], max_new_tokens=10, do_sample=False)
             for each in pixels
         )
+        own, *others = (each[:, ids.shape[1] :] for each in said)
     # A picture to which the model says something else.
     different = next(number for number, other in enumerate(others, 1) if not torch.equal(other, own))
     inputs = {**token_inputs, "pixel_values": pixels[different][None]}

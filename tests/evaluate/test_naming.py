@@ -23,12 +23,9 @@ def words() -> TextTable:
 
 
 def features_of(words: TextTable, vectors: np.ndarray, seen: np.ndarray | None = None) -> GaussianFeatures:
-    return GaussianFeatures(
-        features=vectors.astype(np.float32),
-        weights=np.ones(len(vectors), np.float32) if seen is None else seen.astype(np.float32),
-        mean=words.mean,
-        space=words.space,
-    )
+    weights = (np.ones(len(vectors)) if seen is None else seen).astype(np.float32)
+    vectors = vectors.astype(np.float32)
+    return GaussianFeatures(features=vectors, weights=weights, mean=words.mean, space=words.space)
 
 
 def cosine(vector: np.ndarray, word: np.ndarray, mean: np.ndarray, text_mean: np.ndarray) -> float:

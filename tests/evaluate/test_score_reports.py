@@ -91,11 +91,8 @@ def test_average_precision_is_reported_by_threshold_class_group_and_scene(tmp_pa
     ]
     assert results["spread"]["ap_50"] == {"scenes": 2, "mean": 0.75, "std": pytest.approx(math.sqrt(0.125))}
     classes = {row["class"]: row for row in report.rows["classes"]}
-    assert {name: (row["truths"], row["predictions"]) for name, row in classes.items()} == {
-        "bed": (2, 2),
-        "chair": (1, 1),
-        "wall": (0, 0),
-    }
+    counts = {name: (row["truths"], row["predictions"]) for name, row in classes.items()}
+    assert counts == {"bed": (2, 2), "chair": (1, 1), "wall": (0, 0)}
     assert (classes["bed"]["ap_50"], classes["chair"]["ap_50"], classes["chair"]["ap_25"]) == (1, 0, 1)
     assert math.isnan(classes["wall"]["ap"])
     assert report.table.notes == ("Not counted: 1 mask with a class id that is none of the 3 that are scored.",)
@@ -217,13 +214,8 @@ def test_boxes_of_sentences_are_reported_by_kind_threshold_and_number(tmp_path: 
         | ({"unique_multiple": int(row > 0), "others": 0} if row < 3 else {})
         for row in range(4)
     ]
-    rows = [
-        {
-            "scene_id": each["scene_id"], "object_id": each["object_id"], "ann_id": "0",
-            "bboxes": boxes[each["object_id"]],
-        }
-        for each in truth
-    ]  # fmt: skip
+    keys = ("scene_id", "object_id", "ann_id")
+    rows = [{key: each[key] for key in keys} | {"bboxes": boxes[each["object_id"]]} for each in truth]
     files = written(tmp_path / "predictions.json", rows), written(tmp_path / "truth.json", truth)
     report = referring.score(*files, ScoreOptions(method="mine"))
     results = report.results
@@ -296,13 +288,9 @@ def test_captions_are_reported_with_their_k(tmp_path: Path, min_iou: float, endi
         for text, (scene, number) in texts.items()
     ]
     # IoUs of 0.3 and 0.6; the lamp has a caption of another box.
-    boxes = {
-        "s": [
-            {"caption": "a red chair near the door", "box": cube(0, 0.3)},
-            {"caption": "a blue chair by it", "box": cube(10, 0.6)},
-        ],
-        "t": [{"caption": "a lamp", "box": cube(30)}],
-    }
+    red, blue = ("a red chair near the door", cube(0, 0.3)), ("a blue chair by it", cube(10, 0.6))
+    said = {"s": [red, blue], "t": [("a lamp", cube(30))]}
+    boxes = {scene: [{"caption": text, "box": box} for text, box in each] for scene, each in said.items()}
     files = written(tmp_path / "p.json", boxes), written(tmp_path / "t.json", truth)
     report = captions.score(*files, ScoreOptions(min_iou=min_iou, java=False))
     results, (first, second, third) = report.results, report.rows["objects"]

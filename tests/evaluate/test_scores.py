@@ -65,14 +65,9 @@ def test_only_small_named_objects_that_were_seen_are_asked_for() -> None:
 
 def test_the_first_box_counts_and_any_object_of_its_name_may_be_the_one_found() -> None:
     cups = (thing(1, "cup", 0, 1), thing(2, "cup", 5, 6))
-    localization = Localization(
-        queries=("cup",),
-        relevancy=np.zeros((1, 1), np.float32),
-        thresholds=np.zeros(1, np.float32),
-        probabilities=np.ones(1, np.float32),
-        # Out of order: ranks decide.
-        boxes=(box("cup", 1, 0, 1), box("cup", 0, 5, 6.5)),
-    )
+    # Out of order: ranks decide.
+    boxes, one = (box("cup", 1, 0, 1), box("cup", 0, 5, 6.5)), np.ones(1, np.float32)
+    localization = Localization(queries=("cup",), relevancy=one[None], thresholds=one, probabilities=one, boxes=boxes)
     hits = score_boxes(Scene(name="a", objects=cups), localization, cups)
     assert [hit.iou for hit in hits] == pytest.approx([1 / 1.5**3] * 2)
     assert [hit.oracle_iou for hit in hits] == [1, 1]

@@ -30,13 +30,9 @@ def line_of(kinds: list[int]) -> tuple[Gaussians, GaussianFeatures]:
 
 
 def points_at(positions: list[float] | None, count: int) -> LabeledPoints:
-    return LabeledPoints(
-        scene="s",
-        objects=np.zeros(count, np.int32),
-        names={},
-        gaussians=np.arange(count),
-        positions=None if positions is None else np.array([[x, 0, 0] for x in positions], np.float64),
-    )
+    objects, rows = np.zeros(count, np.int32), np.arange(count)
+    places = None if positions is None else np.array([[x, 0, 0] for x in positions], np.float64)
+    return LabeledPoints(scene="s", objects=objects, names={}, gaussians=rows, positions=places)
 
 
 def classes_at(positions: list[float] | None, kinds: list[int], voters: int) -> list[int]:

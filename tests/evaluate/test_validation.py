@@ -23,11 +23,8 @@ def test_choices_are_those_that_occur_in_the_scene() -> None:
 def walls(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[TrainingScene], OutputSpaces, np.ndarray]:
     dataset, names = prepared(tmp_path_factory.mktemp("prepared"), count=2)
     outputs, codebook = dataset.load_space()
-    return (
-        [TrainingScene([scene]) for scene in dataset.scenes(names)],
-        OutputSpaces(by_teacher={"sides": outputs}),
-        codebook,
-    )
+    scenes = [TrainingScene([scene]) for scene in dataset.scenes(names)]
+    return scenes, OutputSpaces(by_teacher={"sides": outputs}), codebook
 
 
 def judged(

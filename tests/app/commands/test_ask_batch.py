@@ -108,9 +108,9 @@ def test_a_question_that_is_refused_keeps_no_other_from_its_answer(features, tmp
 
 
 def test_an_answer_that_was_begun_with_other_settings_leaves_nothing_behind(features: Path, tmp_path: Path) -> None:
-    file, out = (
-        batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "the crate"}),
+    out, file = (
         tmp_path / "o",
+        batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "the crate"}),
     )
     with serving(crate_refused) as server:
         words = (f"questions={file}", f"vlm.base_url={server.url}")

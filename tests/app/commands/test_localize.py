@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,16 +118,12 @@ def toy_scene(count: int = 200) -> Scene:
     return Scene(name="toy", gaussians=replace(ball, opacities=np.sqrt(ball.opacities)), features={"s": features})
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        LocalizeConfig(mode="raw"),
-        LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.99)),
-        LocalizeConfig(threshold=ThresholdConfig(kind="otsu")),
-    ],
-)
-def test_points_are_those_of_the_mode_and_the_threshold_that_are_asked_for(config: LocalizeConfig) -> None:
-    scene, cameras = toy_scene(), front_camera()
+FIXED, OTSU = ThresholdConfig(kind="fixed", fixed=0.99), ThresholdConfig(kind="otsu")
+
+
+@pytest.mark.parametrize("settings", [{"mode": "raw"}, {"threshold": FIXED}, {"threshold": OTSU}])
+def test_points_are_those_of_the_mode_and_the_threshold_that_are_asked_for(settings: dict[str, Any]) -> None:
+    config, scene, cameras = LocalizeConfig(**settings), toy_scene(), front_camera()
     ((points, drawn),) = search_from_poses(scene, cameras, [None], NAMES, TEXT, config, pictures=False)
     expected = from_pose(scene, cameras, NAMES, TEXT, FromPoseConfig(mode=config.mode, threshold=config.threshold))
     assert [(each["relevancy"], each["threshold"], each["visible"]) for each in points] == [

@@ -177,11 +177,8 @@ def test_a_bare_splat_is_drawn_by_its_renders(tmp_path: Path) -> None:
     out = f"out={tmp_path / 'of_splat'}"
     splat = [str(tmp_path / "room.ply"), "teacher=palette", "orbits=3", "pictures=2", "data.up=[0,0,1]"]
     assert cli.main(["memory", *splat, out, *QUICK[:-1]]) == 0
-    assert sorted(path.name for path in (tmp_path / "of_splat").glob("*.png")) == [
-        "attention.palette.view000.png",
-        "attention.palette.view002.png",
-        "components.palette.png",
-    ]
+    drawn = {"attention.palette.view000.png", "attention.palette.view002.png", "components.palette.png"}
+    assert {path.name for path in (tmp_path / "of_splat").glob("*.png")} == drawn
 
 
 def test_a_run_whose_pictures_cannot_be_drawn_says_how_to_go_on(room, tmp_path, capsys, monkeypatch):

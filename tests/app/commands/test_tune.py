@@ -1,8 +1,10 @@
 """`tune` as a user runs it: prompts are those of `ask`, prepared once; bad input is refused in a line."""
 
+import base64
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from tiny_vlm import PATCH, SIDE
 from tuning_pairs import make_model
 
 from gsencoder.app import main as cli
+from gsencoder.app.commands import tune
 from gsencoder.core.logs import read_log
 from gsencoder.data.prompts import PromptStore
 
@@ -87,8 +90,6 @@ def test_prompts_are_those_that_ask_sends(given: Path, tmp_path: Path) -> None:
     assert cli.main([*arguments, *vlm, *QUICK[:3], "quiet=true"]) == 0
     parts = json.loads((tmp_path / "asked" / "request.json").read_text())["messages"][0]["content"]
     assert parts[-1]["text"] == prompt.text
-    import base64
-
     sent = [base64.b64decode(part["image_url"]["url"].partition(",")[2]) for part in parts[:-1]]
     pictures = [(tmp_path / "out.prepared" / "pictures" / name).read_bytes() for name in prompt.pictures]
     assert sent == pictures
@@ -96,15 +97,13 @@ def test_prompts_are_those_that_ask_sends(given: Path, tmp_path: Path) -> None:
 
 
 def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(given, tmp_path, monkeypatch):
-    from gsencoder.app.commands import tune as tuning_prompts
+    made, store_prompt = list[str](), tune.store_prompt
 
-    made: list[str] = []
-    store_prompt = tuning_prompts.store_prompt
-    monkeypatch.setattr(
-        tuning_prompts,
-        "store_prompt",
-        lambda *given, **more: (made.append(given[3].text), store_prompt(*given, **more)),
-    )
+    def stored(*given: Any, **more: Any) -> Any:
+        made.append(given[3].text)
+        return store_prompt(*given, **more)
+
+    monkeypatch.setattr(tune, "store_prompt", stored)
     prepare = [f"prepared={tmp_path / 'prompts'}", "prepare_only=true"]
     assert cli.main(words(given, tmp_path / "a", *prepare)) == 0
     assert sorted(made) == sorted(text for _, text, _ in QUESTIONS)

@@ -27,16 +27,11 @@ KINDS = {name: f"a folder that `gsencoder {name}` wrote" for name in WRITTEN} | 
     "notes.csv": "a .csv file",
 }  # fmt: skip
 FEATURES = "expected a folder of features, which `gsencoder fuse`, `encode`, `memory` and `pack` write"
+FEATURE_FOLDERS = ("fuse", "memory", "pack")
 READERS = {
-    "localize, views, ask, pack, view, select, evaluate features=": (
-        load_features,
-        ("fuse", "memory", "pack"),
-        FEATURES,
-    ),
+    "localize, views, ask, pack, view, select, evaluate features=": (load_features, FEATURE_FOLDERS, FEATURES),
     "ask of a set, tune features=": (
-        lambda path: scene_folders([path], ["room"]),
-        ("fuse", "memory", "pack", "several"),
-        FEATURES,
+        lambda path: scene_folders([path], ["room"]), (*FEATURE_FOLDERS, "several"), FEATURES,
     ),
     "export memory=": (load_memories, ("memory",), "expected a folder with a memory, which `gsencoder memory` writes"),
     "weights=": (load_encoder, ("train",), "`gsencoder train` w"),
@@ -46,7 +41,7 @@ READERS = {
         ("scene", "reconstruct", "pack", "fuse", "memory", "missing", "notes.csv"),
         "neither a scene nor a folder of scenes; a scene holds one of",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.fixture

@@ -76,17 +76,12 @@ class Toy:
         yield run, judge
 
     def stage(self) -> Stage:
-        return Stage(
-            name="fusion",
-            knobs=(
-                Knob(name="effort", key="effort", values=(1, 2, 8), exact=8),
-                Knob(name="color", key="color", values=(1, 2)),
-            ),
-            base=ToySettings(),
-            open=self.opened,
-            accuracy="error",
-            cost="bytes",
+        knobs = (
+            Knob(name="effort", key="effort", values=(1, 2, 8), exact=8),
+            Knob(name="color", key="color", values=(1, 2)),
         )
+        base = ToySettings()
+        return Stage(name="fusion", knobs=knobs, base=base, open=self.opened, accuracy="error", cost="bytes")
 
 
 def record(scene: str, cpu: list[float], scores: Scores | None = None, **knobs: int) -> Record:
