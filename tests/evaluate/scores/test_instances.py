@@ -68,12 +68,9 @@ def test_a_mask_mostly_on_vertices_without_class_is_ignored_at_lower_thresholds(
     assert scores.classes["bed"]["ap_50"] == scores.classes["bed"]["ap_25"] == 1
 
 
-def test_a_truth_of_99_vertices_does_not_count_and_one_of_100_does() -> None:
+def test_truths_and_masks_of_99_vertices_do_not_count_and_those_of_100_do() -> None:
     assert math.isnan(scored(truth_of((0, 99, 4001)), (0, 100, BED, 1.0)).overall["ap"])
     assert scored(truth_of((0, 100, 4001)), (0, 100, BED, 1.0)).overall["ap"] == 1
-
-
-def test_a_mask_of_99_vertices_does_not_count() -> None:
     scores = scored(truth_of((0, 100, 4001)), (0, 99, BED, 1.0))
     assert scores.overall["ap"] == 0
     assert scores.predictions.tolist() == [0, 0, 0]
