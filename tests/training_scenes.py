@@ -1,6 +1,7 @@
 """Small scenes with a teacher, prepared for training, that several test files stand on."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 

@@ -23,6 +23,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.splats.files import load_splat
 from gsencoder.reconstruct import run as reconstruct
+from gsencoder.reconstruct import score as scores
 from gsencoder.reconstruct.score import split
 from gsencoder.types import Views
 
@@ -220,7 +221,7 @@ def test_every_eighth_photograph_is_kept() -> None:
 
 
 def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(room, built, tmp_path, monkeypatch):
-    out, score, calls = tmp_path / "out", reconstruct.score, []
+    out, score, calls = tmp_path / "out", scores.score, []
 
     def cut_off_at_the_last(*arguments: object) -> object:
         calls.append(arguments)
@@ -228,7 +229,7 @@ def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(room, built, 
 
     words = ["reconstruct", str(room), f"out={out}", *QUICK]
     with monkeypatch.context() as patched:
-        patched.setattr(reconstruct, "score", cut_off_at_the_last)
+        patched.setattr(scores, "score", cut_off_at_the_last)
         assert cli.main(words) == 130
     with monkeypatch.context() as patched:
         patched.setattr(reconstruct.Optimizer, "advance", never)
