@@ -1,24 +1,29 @@
-"""Classes of ScanNet's benchmarks, the map of raw names, splits, and the truth files that are made of them."""
+"""Classes of ScanNet and ScanNet++: maps of raw names, splits, and the truth files that are made of them."""
 
 from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pytest
+from labeled_scans import group, write_scannetpp_labels
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.classes import (
     COLUMNS,
     ClassTable,
+    ids_of_benchmark,
     ids_of_names,
     instance_ids,
     load_classes,
     read_class_list,
+    read_instance_classes,
     read_label_map,
     scannet_classes,
     vertex_classes,
 )
 from gsencoder.data.labels.files import read_split
+from gsencoder.evaluate.benchmarks.instances import instance_ids_of_scan
+from gsencoder.evaluate.benchmarks.semantics import class_ids_of_scan
 from gsencoder.types import MeshLabels
 
 
@@ -181,3 +186,67 @@ def test_names_and_ids_are_there_once(tmp_path: Path) -> None:
     assert load_classes(str(path)).ids == (0,)
     with pytest.raises(InputError, match="classes: 'bed' has the id 0, which files of instances cannot hold"):
         load_classes(str(path), instances=True)
+
+
+MAP = """class,count,instance_map_to,semantic_map_to
+wall,90,None,
+walls,3,,wall
+table,80,,
+desk,40,table,table
+remove,9,None,None
+office desk,2,,desk
+"""
+
+
+@pytest.fixture
+def lists(tmp_path: Path) -> Path:
+    """A folder like metadata/semantic_benchmark."""
+    (tmp_path / "top100.txt").write_text("wall\nfloor\ntable\n")
+    (tmp_path / "top100_instance.txt").write_text("table\n")
+    (tmp_path / "map_benchmark.csv").write_text(MAP)
+    return tmp_path
+
+
+def test_names_lead_to_classes_as_in_the_toolkit(lists: Path) -> None:
+    # Nothing as the target keeps the name, None drops it, and targets are not mapped again.
+    classes = load_classes(str(lists / "top100.txt"))
+    assert classes == ClassTable(names=("wall", "floor", "table"), ids=(0, 1, 2))
+    ids = ids_of_benchmark(lists / "map_benchmark.csv", classes)
+    assert ids == {"wall": 0, "walls": 0, "table": 2, "desk": 2}
+
+
+def test_instances_have_the_classes_of_the_second_list_and_the_ids_of_the_first(lists: Path) -> None:
+    assert load_classes(str(lists / "top100.txt"), instances=True) == ClassTable(names=("table",), ids=(2,))
+    (lists / "top100_instance.txt").write_text("tables\n")
+    with pytest.raises(InputError, match="'tables' is no class of top100.txt"):
+        read_instance_classes(lists / "top100.txt")
+    (lists / "top100_instance.txt").unlink()
+    with pytest.raises(InputError, match=r"top100_instance.txt: no such file"):
+        load_classes(str(lists / "top100.txt"), instances=True)
+
+
+def test_the_truth_of_a_scan_is_that_of_the_objects_with_a_class(lists: Path) -> None:
+    # Vertices 0 and 1 are a wall, 2 and 3 a desk, 4 is to be removed; "remove" claims the desk, too, and has no class.
+    segments = np.array([0, 0, 1, 1, 2])
+    groups = [group(1, "wall", [0]), group(2, "desk", [1]), group(3, "remove", [1]), group(4, "remove", [2])]
+    scan = write_scannetpp_labels(lists / "abc", np.eye(5, 3, dtype=np.float32), segments, groups)
+    every = load_classes(str(lists / "top100.txt"))
+    ids = ids_of_benchmark(lists / "map_benchmark.csv", every)
+    assert class_ids_of_scan(scan, ids, every).tolist() == [0, 0, 2, 2, -1]
+    ids_of_instances = instance_ids_of_scan(scan, ids, load_classes(str(lists / "top100.txt"), instances=True))
+    assert ids_of_instances.tolist() == [1, 1, 2002, 2002, 0]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("class,count\nwall,3\n", "its first line lacks semantic_map_to"),
+        ("class,semantic_map_to\nwall,None\n", "no name leads to one of the 1 classes"),
+        ("class,semantic_map_to\nwall,wall\n", "no name leads to one of the 1 classes"),
+        ('class,semantic_map_to\n"wall', "not a readable table"),
+    ],
+)
+def test_maps_that_are_none_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "map.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        ids_of_benchmark(tmp_path / "map.csv", ClassTable(names=("sofa",), ids=(1,)))
