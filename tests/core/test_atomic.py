@@ -5,7 +5,9 @@ import os
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -47,11 +49,8 @@ def test_what_a_killed_run_left_is_written_over_by_the_next(tmp_path: Path) -> N
 
 
 def test_a_hidden_file_that_cannot_be_emptied_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(descriptor: int, size: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     write_bytes(tmp_path / "a", b"earlier")
-    monkeypatch.setattr(os, "ftruncate", refused)
+    monkeypatch.setattr(os, "ftruncate", Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
     with pytest.raises(InputError, match="no space left"):
         write_bytes(tmp_path / "a", b"new")
     assert names(tmp_path) == ["a"]
@@ -68,11 +67,8 @@ def test_of_many_writers_every_reader_sees_one_whole(tmp_path: Path) -> None:
             write_bytes(tmp_path / "x", part)
             seen.add((tmp_path / "x").read_bytes())
 
-    threads = [threading.Thread(target=write, args=(part,)) for part in parts]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(len(parts)) as pool:
+        list(pool.map(write, parts))
     assert seen <= set(parts)
     assert names(tmp_path) == ["x"]
 
@@ -181,31 +177,24 @@ def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
         Log(tmp_path, done=1, events=False)
 
 
-def test_events_and_pictures_are_written_for_tensorboard(tmp_path: Path) -> None:
+def test_tensorboard_shows_pictures_and_the_steps_of_a_continued_run_once(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
-    log = Log(tmp_path, done=0, events=True)
-    log.add(0, {"loss": 1.0})
-    log.picture(0, "validation/sheet", np.zeros((4, 4, 3), np.uint8))
-    assert list((tmp_path / "tensorboard").glob("events*"))
-    assert shown(tmp_path / "tensorboard") == [(0, 1.0)]
-    assert (tmp_path / "validation" / "sheet_000000.png").is_file()
-
-
-def shown(folder: Path) -> list[tuple[int, float]]:
-    """The losses that TensorBoard reads from a folder."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    read = EventAccumulator(str(folder))
-    read.Reload()
-    return [(event.step, event.value) for event in read.Scalars("loss")]
-
-
-def test_tensorboard_shows_the_steps_of_a_continued_run_once(tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard")
     log = Log(tmp_path, done=0, events=True)
     for step in range(1, 5):
         log.add(step, {"loss": float(step)})
+    log.picture(0, "validation/sheet", np.zeros((4, 4, 3), np.uint8))
+    assert (tmp_path / "validation" / "sheet_000000.png").is_file()
     again = Log(tmp_path, done=2, events=True, begun=True)
     for step in range(3, 6):
         again.add(step, {"loss": 10.0 * step})
-    assert shown(tmp_path / "tensorboard") == [(1, 1.0), (2, 2.0), (3, 30.0), (4, 40.0), (5, 50.0)]
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [(event.step, event.value) for event in events.Scalars("loss")] == [
+        (1, 1.0),
+        (2, 2.0),
+        (3, 30.0),
+        (4, 40.0),
+        (5, 50.0),
+    ]

@@ -32,14 +32,9 @@ def equation(memory: QueryMemory, queries: np.ndarray) -> np.ndarray:
     return np.asarray(weights / weights.sum(axis=1, keepdims=True) @ memory.bank.components)
 
 
-def module_of(memory: QueryMemory) -> MemoryAttention:
-    return MemoryAttention(
-        memory.bank,
-        torch.from_numpy(memory.projection),
-        mean=memory.mean,
-        scoring=memory.scoring,
-        temperature=memory.temperature,
-    )
+def module_of(memory: QueryMemory, **values: torch.Tensor) -> MemoryAttention:
+    settings = {"mean": memory.mean, "scoring": memory.scoring, "temperature": memory.temperature}
+    return MemoryAttention(memory.bank, torch.from_numpy(memory.projection), **settings, **values)
 
 
 @pytest.mark.parametrize("scoring", SCORINGS)
@@ -150,14 +145,7 @@ def test_other_values_than_the_components_are_averaged_with_the_same_weights() -
     queries = memory.queries[1:7]
     expected = memory.attention(queries) @ values
     np.testing.assert_allclose(memory.attend(queries, values), expected, rtol=1e-4, atol=1e-5)
-    module = MemoryAttention(
-        memory.bank,
-        torch.from_numpy(memory.projection),
-        mean=memory.mean,
-        scoring=memory.scoring,
-        temperature=memory.temperature,
-        values=torch.from_numpy(values),
-    )
+    module = module_of(memory, values=torch.from_numpy(values))
     np.testing.assert_allclose(module(torch.from_numpy(queries)).detach().numpy(), expected, rtol=1e-3, atol=1e-4)
 
 

@@ -1,7 +1,6 @@
 """Memory banks: what they cover, where their components come from, and what cannot be reduced; cells at the mean, rare
 kinds, many names, and small samples."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -34,10 +33,7 @@ def dense_maps(views: int = 5, *, seed: int = 0, holes: bool = True) -> list[Fea
 
 
 def stream(maps: list[FeatureMap]) -> MapStream:
-    def give() -> Iterator[tuple[int, FeatureMap]]:
-        return iter(enumerate(maps))
-
-    return give
+    return lambda: iter(enumerate(maps))
 
 
 def all_rows(maps: list[FeatureMap]) -> np.ndarray:
@@ -80,8 +76,7 @@ def test_the_published_bank_states_the_share_that_it_covers() -> None:
     maps = dense_maps()
     rows = all_rows(maps)
     mean = rows.mean(axis=0)
-    config = BankConfig(method="paper", threshold=0.85, drop_last=100)
-    bank = build_bank(stream(maps), SPACE, mean, config)
+    bank = build_bank(stream(maps), SPACE, mean, BankConfig(method="paper", threshold=0.85, drop_last=100))
     expected, _ = reduce_as_published(unit_rows(rows - mean), 0.85, drop_last=100)
     np.testing.assert_allclose(bank.components, rows[expected], rtol=1e-5, atol=1e-6)
     best = cosines(rows, bank.components, mean).max(axis=1)
@@ -177,9 +172,9 @@ def kinds(count: int, seed: int = 0) -> np.ndarray:
 
 def best_cosines(rows: np.ndarray, bank: MemoryBank) -> np.ndarray:
     """Of features with the nearest component, about the mean of the bank."""
-    a, b = (each.astype(np.float64) - bank.mean for each in (rows, bank.components))
-    b = b[np.linalg.norm(b, axis=1) > 1e-3 * np.linalg.norm(bank.mean.astype(np.float64))]
-    return np.asarray(((a / np.linalg.norm(a, axis=1)[:, None]) @ (b / np.linalg.norm(b, axis=1)[:, None]).T).max(1))
+    lengths = np.linalg.norm(bank.components.astype(np.float64) - bank.mean, axis=1)
+    off_mean = lengths > 1e-3 * np.linalg.norm(bank.mean.astype(np.float64))
+    return cosines(rows, bank.components[off_mean], bank.mean).max(axis=1)
 
 
 def mixed_maps(rounding: float = 0.0) -> tuple[list[FeatureMap], np.ndarray]:
@@ -282,9 +277,7 @@ def published(features: np.ndarray, threshold: float) -> np.ndarray:
     return reduce_as_published(unit_rows(features), threshold)[0]
 
 
-def transcription(
-    features: np.ndarray, threshold: float, chunk: int, *, drop_last: bool
-) -> tuple[list[int], np.ndarray]:
+def transcription(features: np.ndarray, threshold: float, chunk: int, *, drop_last: bool) -> tuple[list, np.ndarray]:
     """Algorithm 1, line by line; the code that M3's authors published does not drop the last chunk."""
     unit = features / np.linalg.norm(features, axis=1, keepdims=True)
     components, used = [], np.zeros(len(unit), bool)
@@ -388,17 +381,10 @@ def numbered_maps(*sizes: tuple[int, int], missing: float = 0.0) -> list[Feature
     return maps
 
 
-def numbered_stream(maps: list[FeatureMap]) -> MapStream:
-    def give() -> Iterator[tuple[int, FeatureMap]]:
-        return iter(enumerate(maps))
-
-    return give
-
-
 @pytest.mark.parametrize("limit", [1, 59, 60, 61])
 def test_a_sample_has_so_many_different_features_of_the_maps_in_their_order(limit: int) -> None:
     maps = numbered_maps((4, 5), (3, 10), (2, 5))
-    sample = draw_sample(numbered_stream(maps), NUMBERS, limit)
+    sample = draw_sample(stream(maps), NUMBERS, limit)
     assert sample.total == 60
     assert len(sample.features) == min(limit, 60)
     keys = [(view, cell) for view, cell in sample.features.tolist()]
@@ -408,11 +394,11 @@ def test_a_sample_has_so_many_different_features_of_the_maps_in_their_order(limi
 
 def test_cells_without_a_feature_are_in_no_sample_and_not_counted() -> None:
     maps = numbered_maps((20, 20), (20, 20), missing=0.5)
-    sample = draw_sample(numbered_stream(maps), NUMBERS, 10_000)
+    sample = draw_sample(stream(maps), NUMBERS, 10_000)
     rows = np.concatenate([raw_features(view, each)[0] for view, each in enumerate(maps)])
     np.testing.assert_array_equal(sample.features, rows)
     assert sample.total == len(rows) < 500
-    empty = draw_sample(numbered_stream(numbered_maps((3, 3), missing=1.1)), NUMBERS, 5)
+    empty = draw_sample(stream(numbered_maps((3, 3), missing=1.1)), NUMBERS, 5)
     assert (empty.features.shape, empty.total) == ((0, 2), 0)
 
 
@@ -422,7 +408,7 @@ def test_every_feature_is_drawn_equally_often() -> None:
     seeds, limit = 300, 25
     counts = {}
     for seed in range(seeds):
-        for key in map(tuple, draw_sample(numbered_stream(maps), NUMBERS, limit, seed=seed).features.tolist()):
+        for key in map(tuple, draw_sample(stream(maps), NUMBERS, limit, seed=seed).features.tolist()):
             counts[key] = counts.get(key, 0) + 1
     drawn = np.array([counts.get((view, cell), 0) for view, n in enumerate((64, 4, 32)) for cell in range(n)])
     share = limit / 100
@@ -432,14 +418,14 @@ def test_every_feature_is_drawn_equally_often() -> None:
 
 
 def test_a_view_is_sampled_whatever_cells_another_view_gives() -> None:
-    sample = draw_sample(numbered_stream(numbered_maps((20, 20), (20, 20))), NUMBERS, 200)
+    sample = draw_sample(stream(numbered_maps((20, 20), (20, 20))), NUMBERS, 200)
     first, second = (set(sample.features[sample.features[:, 0] == view, 1].tolist()) for view in (0, 1))
     # A quarter of all cells is drawn, and a quarter of these in the other view as well.
     assert len(first & second) < 0.5 * min(len(first), len(second))
 
 
 def test_a_seed_gives_the_same_sample_again_and_another_seed_another_one() -> None:
-    maps = numbered_stream(numbered_maps((10, 10), (10, 10)))
+    maps = stream(numbered_maps((10, 10), (10, 10)))
     first, again, other = (draw_sample(maps, NUMBERS, 20, seed=seed).features for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
@@ -447,7 +433,7 @@ def test_a_seed_gives_the_same_sample_again_and_another_seed_another_one() -> No
 
 def test_the_cell_of_a_component_is_where_the_affine_of_its_map_puts_its_source() -> None:
     maps = numbered_maps((4, 5), (3, 10), (2, 5))
-    bank = build_bank(numbered_stream(maps), NUMBERS, np.zeros(2, np.float32))
+    bank = build_bank(stream(maps), NUMBERS, np.zeros(2, np.float32))
     assert len(bank) > 2
     assert len(set(bank.sources[:, 0].tolist())) > 1
     for (view, row, column), (left, top, right, bottom) in zip(bank.sources.tolist(), bank.cells, strict=True):

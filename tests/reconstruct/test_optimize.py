@@ -163,8 +163,7 @@ def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
     images = [np.array(image) for image in views.images or ()]
     images[0][:], images[1][:] = 0, 255
     config = OptimizeConfig(steps=60, sh_degree=3, shrinks=(3,), shares=(1.0,))
-    views = replace(views, images=images)
-    one = wall_optimizer(config, start, views, (0, 1, 2, 3), prune=PruneConfig(at=(0.5,)))
+    one = wall_optimizer(config, start, replace(views, images=images), (0, 1, 2, 3), prune=PruneConfig(at=(0.5,)))
     for _ in range(60):
         one.advance()
     assert all(bool(torch.isfinite(value).all()) for value in one.parameters.values())
@@ -251,16 +250,9 @@ def two_cameras() -> Cameras:
 
 
 def photos(cameras: Cameras, shrink: int) -> list[tuple[int, ScaledPhotograph]]:
-    scale = torch.diag(torch.tensor([1 / shrink, 1 / shrink, 1]))
-    return [
-        (
-            view,
-            ScaledPhotograph(
-                image=torch.zeros(48 // shrink, 64 // shrink, 3), mask=None, depth=None, K=scale @ torch.from_numpy(K)
-            ),
-        )
-        for view, K in enumerate(cameras.Ks)
-    ]
+    scale, black = torch.diag(torch.tensor([1 / shrink, 1 / shrink, 1])), torch.zeros(48 // shrink, 64 // shrink, 3)
+    Ks = [scale @ torch.from_numpy(K) for K in cameras.Ks]
+    return [(view, ScaledPhotograph(image=black, mask=None, depth=None, K=K)) for view, K in enumerate(Ks)]
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
@@ -282,14 +274,9 @@ def test_a_contribution_is_counted_in_pixels_of_the_photograph_whatever_size_it_
 def test_what_is_wider_than_a_share_of_some_picture_is_taken_out(shrink: int) -> None:
     """Spheres whose radius of three standard deviations (3.3 are drawn) is so many widths of the first picture."""
     radii = np.array([0.05, 0.2, 0.8, 1.1, 3.0])
-    one = random_gaussians(5)
-    depth = 100.0
-    splat = replace(
-        one,
-        means=np.tile(np.float32([0, 0, depth]), (5, 1)),
-        scales=np.repeat(radii[:, None] * 64 / 50 * depth / 3, 3, axis=1).astype(np.float32),
-        opacities=np.full(5, 0.99, np.float32),
-    )
+    means, opacities = np.tile(np.float32([0, 0, 100]), (5, 1)), np.full(5, 0.99, np.float32)
+    scales = np.repeat(radii[:, None] * 64 / 50 * 100 / 3, 3, axis=1).astype(np.float32)
+    splat = replace(random_gaussians(5), means=means, scales=scales, opacities=opacities)
     cameras = two_cameras()
     raw, some = parameters_from(splat, 0), photos(cameras, shrink)
     everything = rows_to_keep(raw, cameras, some, NOTHING, RasterConfig())

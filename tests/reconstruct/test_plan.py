@@ -1,6 +1,7 @@
 """Plans: sizes of photographs, steps, colors and Gaussians that fit a time or a size."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -53,9 +54,8 @@ def test_small_photographs_stay_and_phone_photographs_are_made_smaller() -> None
     assert 0.05 < phone < 0.2
     assert choose_scale(pictures(4000, 3000), ReconstructBudget(minutes=0.0), CPU, USUAL) == 1
     # More time gives larger pictures, whatever they are; a GPU needs less.
-    scales = [
-        choose_scale(pictures(4000, 3000), ReconstructBudget(minutes=float(m)), CPU, USUAL) for m in (3, 10, 30, 100)
-    ]
+    longer = [ReconstructBudget(minutes=float(minutes)) for minutes in (3, 10, 30, 100)]
+    scales = [choose_scale(pictures(4000, 3000), each, CPU, USUAL) for each in longer]
     assert scales == sorted(scales)
     assert scales[0] < scales[-1]
     assert choose_scale(pictures(4000, 3000), ten, torch.device("cuda"), USUAL) > phone
@@ -127,8 +127,10 @@ def costs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planning, "measured_costs", lambda *_: made)
 
 
-def planned(optimizer: Optimizer, budget: ReconstructBudget, *, spent: float = 0.0, double: bool = False) -> Plan:
-    return make_plan(optimizer, [0, 3], budget, lambda steps: 2, double_means=double, began=0.0, now=lambda: spent)
+def planned(
+    optimizer: Optimizer, budget: ReconstructBudget, *, spent=0.0, double=False, validations=lambda steps: 2
+) -> Plan:
+    return make_plan(optimizer, [0, 3], budget, validations, double_means=double, began=0.0, now=lambda: spent)
 
 
 def test_less_room_first_costs_degrees_of_color_and_then_gaussians(optimizer: Optimizer) -> None:
@@ -150,10 +152,7 @@ def test_less_room_first_costs_degrees_of_color_and_then_gaussians(optimizer: Op
 
 
 def test_where_nothing_contributes_yet_all_gaussians_are_to_fit(optimizer, monkeypatch):
-    def none_left(_: Optimizer) -> None:
-        raise InputError("reconstruct: pruning would leave none")
-
-    monkeypatch.setattr(Optimizer, "contributing", none_left)
+    monkeypatch.setattr(Optimizer, "contributing", Mock(side_effect=InputError("pruning would leave none")))
     count = len(optimizer.parameters["means"])
     for row, degree in ((164, 2), (163, 1), (103, 0)):
         size = (2048 + count * row) / 1e6 + 1e-9
@@ -212,9 +211,7 @@ def test_seconds_are_kept_for_as_many_validations_as_the_steps_have_and_for_the_
     measured = Costs(steps={1: 3.0, 2: 3.0}, pruning=4.0, validation=6.0, picture=4.0)
     monkeypatch.setattr(planning, "measured_costs", lambda *_: measured)
     budget = ReconstructBudget(seconds=500.0)
-    plan = make_plan(
-        optimizer, [0, 3], budget, lambda steps: 2 + steps // 50, double_means=False, began=0.0, now=lambda: 20.0
-    )
+    plan = planned(optimizer, budget, spent=20.0, validations=lambda steps: 2 + steps // 50)
     needed = 20 + 12 + 6.0 * (2 + plan.steps // 50) + 4.0 * MAX_COMPARISONS + 3.0 * plan.steps
     # The validations are those of nearly as many steps.
     assert PLANNED * 500 - 15 < needed <= PLANNED * 500 + 6

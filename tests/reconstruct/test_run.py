@@ -1,6 +1,7 @@
 """Python's `reconstruct()`: where it begins, what it returns, how it continues; and the scores of what it returns."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +24,8 @@ from gsencoder.render.images import IDENTITY
 from gsencoder.render.rasterize import Raster
 from gsencoder.types import Scene, Views
 
-QUICK = ReconstructConfig(
-    holdout=3,
-    validate_every=2,
-    seeds=SeedConfig(voxel=0.15),
-    optimize=OptimizeConfig(steps=4, shrinks=(1,), shares=(1.0,)),
-)
+SHORT = OptimizeConfig(steps=4, shrinks=(1,), shares=(1.0,))
+QUICK = ReconstructConfig(holdout=3, validate_every=2, seeds=SeedConfig(voxel=0.15), optimize=SHORT)
 
 
 @pytest.fixture(scope="module")
@@ -180,25 +177,18 @@ def half_empty_views(*, depth: bool = False) -> Views:
 def test_the_loss_is_the_opacity_over_empty_pixels() -> None:
     photo = Photographs(half_empty_views()).at_scale(0)
     alpha = torch.rand((72, 96), generator=torch.Generator().manual_seed(0), requires_grad=True)
-    raster = Raster(
-        rgb=photo.image.clone().requires_grad_(),
-        alpha=alpha,
-        depth=alpha,
-        means2d=torch.zeros(1, 2),
-        radii=torch.zeros(1),
-    )
-    terms = losses_of(raster, photo, ssim_weight=0.0, depth_weight=0.0, empty_weight=0.5)
+    nothing = {"means2d": torch.zeros(1, 2), "radii": torch.zeros(1)}
+    raster = Raster(rgb=photo.image.clone().requires_grad_(), alpha=alpha, depth=alpha, **nothing)
+    losses = partial(losses_of, raster, ssim_weight=0.0, depth_weight=0.0)
+    terms = losses(photo, empty_weight=0.5)
     used = 1 - (EMPTY_ABOVE + 2) / 72
-    assert float(terms["empty"].detach()) == pytest.approx(
-        0.5 * float(alpha.detach()[:EMPTY_ABOVE].sum()) / (72 * 96) / used
-    )
+    expected = 0.5 * float(alpha.detach()[:EMPTY_ABOVE].sum()) / (72 * 96) / used
+    assert float(terms["empty"].detach()) == pytest.approx(expected)
     terms["empty"].backward()
     assert (alpha.grad[:EMPTY_ABOVE] > 0).all()
     assert not alpha.grad[EMPTY_ABOVE:].any()
-    assert "empty" not in losses_of(raster, photo, ssim_weight=0.0, depth_weight=0.0, empty_weight=0.0)
-    assert "empty" not in losses_of(
-        raster, replace(photo, empty=None), ssim_weight=0.0, depth_weight=0.0, empty_weight=1.0
-    )
+    assert "empty" not in losses(photo, empty_weight=0.0)
+    assert "empty" not in losses(replace(photo, empty=None), empty_weight=1.0)
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5])

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -105,9 +106,7 @@ def test_links_that_lead_out_of_the_folder_are_refused_before_photographs_are_pl
 def test_a_run_that_was_cut_off_is_not_continued_with_other_poses(photographs, work, monkeypatch):
     placing = Placing(monkeypatch)
     (work / CHECKPOINT_FILE).symlink_to("gone")
-    with pytest.raises(
-        InputError, match=f"a run was cut off here, and where its photographs were placed .{PLACED_FILE}"
-    ):
+    with pytest.raises(InputError, match=f"a run was cut off here, and where .* placed .{PLACED_FILE}"):
         open_scene(photographs, work)
     assert placing.calls == []
 
@@ -146,9 +145,8 @@ def test_photographs_far_aside_are_placed_by_features_that_follow_slants(shared:
     registration = opening.register_photographs(photographs, work, SfmConfig(size=400, features=4096))
     assert len(registration.placed) >= 8
     assert not set(registration.placed) & set(registration.missing)
-    truth = {
-        image.name: image.cam_from_world for image in read_colmap(plush / "sparse", plush / "images", plush).images
-    }
+    known = read_colmap(plush / "sparse", plush / "images", plush).images
+    truth = {image.name: image.cam_from_world for image in known}
     ours = read_colmap(registration.model, photographs, photographs).images
     # The rotation of the world that fits all of them best; what is left is what poses are off.
     turns = Rotation.from_matrix([image.cam_from_world[:3, :3].T @ truth[image.name][:3, :3] for image in ours])
@@ -162,13 +160,9 @@ def test_a_second_look_is_taken_where_few_of_few_are_placed(tmp_path: Path, monk
     looks: list[bool] = []
     sizes: list[int] = []
 
-    class Model:
-        def num_reg_images(self) -> int:
-            return sizes[-1]
-
-    def made(*arguments: object) -> list[Model]:
+    def made(*arguments: object) -> list[SimpleNamespace]:
         looks.append(bool(arguments[-1]))
-        return [Model()]
+        return [SimpleNamespace(num_reg_images=lambda: sizes[-1])]
 
     monkeypatch.setattr(opening, "_map", made)
     monkeypatch.setattr(opening, "check_picture", lambda path: None)
