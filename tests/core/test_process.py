@@ -41,13 +41,10 @@ SLURM = {
 }
 
 
-def test_torchrun_tells_rank_and_size() -> None:
+def test_torchrun_and_slurm_tell_rank_and_size_and_where_to_meet() -> None:
     process, meeting = rank_from_environment({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"})
     assert (process.rank, process.world_size, process.local_rank, process.is_first) == (3, 4, 1, False)
     assert meeting == "env://"
-
-
-def test_slurm_tells_rank_and_size_and_where_to_meet() -> None:
     process, meeting = rank_from_environment(SLURM)
     assert (process.rank, process.world_size, process.local_rank) == (5, 8, 1)
     assert meeting == "tcp://gpu03:23456"

@@ -24,27 +24,21 @@ DISTANCE, FIELD = 4.0, 0.69
 """Of the cameras from the middle, and their horizontal field of view in radians, as in the NeRF synthetic scenes."""
 
 
-def _solid(
-    shape: Literal["box", "ellipsoid", "cylinder"],
-    center: tuple[float, float, float],
-    half: tuple[float, float, float],
-    yaw: float = 0.0,
-) -> Solid:
-    return Solid(shape=shape, center=np.array(center), half=np.array(half), yaw=yaw)
-
-
-SOLIDS = (
-    _solid("box", (0, 0, -0.35), (0.8, 0.5, 0.08)),
-    _solid("box", (-0.35, 0, 0), (0.25, 0.3, 0.3), 0.3),
-    _solid("cylinder", (0.35, 0.1, 0.05), (0.18, 0.18, 0.4)),
-    _solid("ellipsoid", (0.35, 0.1, 0.6), (0.3, 0.3, 0.2)),
-    _solid("box", (0.5, -0.35, -0.15), (0.05, 0.05, 0.15)),
-)
+SOLIDS = [
+    Solid(shape=shape, center=np.array(center), half=np.array(half), yaw=yaw)
+    for shape, center, half, yaw in (
+        ("box", (0, 0, -0.35), (0.8, 0.5, 0.08), 0.0),
+        ("box", (-0.35, 0, 0), (0.25, 0.3, 0.3), 0.3),
+        ("cylinder", (0.35, 0.1, 0.05), (0.18, 0.18, 0.4), 0.0),
+        ("ellipsoid", (0.35, 0.1, 0.6), (0.3, 0.3, 0.2), 0.0),
+        ("box", (0.5, -0.35, -0.15), (0.05, 0.05, 0.15), 0.0),
+    )
+]
 WHITE_SOLID = 3
 """This one is as white as paper, so that a white background hides its outline in part."""
 
 
-def hemisphere_cameras(count: int, size: int = 80, *, first: int = 0) -> Cameras:
+def hemisphere_cameras(count: int, size: int, *, first: int = 0) -> Cameras:
     """Cameras on a golden-angle spiral over the upper hemisphere, square pictures."""
     steps = np.arange(count) + first + 0.5
     sines, turns = 0.1 + 0.75 * (steps * 0.618034 % 1), steps * math.pi * (3 - math.sqrt(5))
@@ -79,32 +73,19 @@ def look(cameras: Cameras, view: int, *, oversampling: int = 3) -> tuple[np.ndar
     return summed / np.maximum(alpha, 1e-9)[..., None], alpha
 
 
-def write_blender(
-    folder: Path,
-    *,
-    size: int = 80,
-    train: int = 12,
-    others: int = 2,
-    ground: Ground = "transparent",
-    suffix: str = ".png",
-    oversampling: int = 3,
-) -> dict[str, Cameras]:
-    """Writes transforms_train.json, _val and _test with their pictures; the cameras of each."""
-    written, first = {}, 0
-    for split, count in (("train", train), ("val", others), ("test", others)):
-        cameras = hemisphere_cameras(count, size, first=first)
+def write_blender(folder: Path, ground: Ground, suffix: str) -> None:
+    """Writes transforms_train.json of six pictures, _val and _test of one, with their pictures."""
+    first = 0
+    for split, count in (("train", 6), ("val", 1), ("test", 1)):
+        cameras = hemisphere_cameras(count, SIZE, first=first)
         first += count
         frames = []
         (folder / split).mkdir(parents=True, exist_ok=True)
         for view, pose in enumerate(cameras.world_from_cam.astype(float) @ OPENCV_FROM_OPENGL):
-            color, alpha = look(cameras, view, oversampling=oversampling)
-            file = folder / split / f"r_{view}{suffix}"
-            save_over(file, color, alpha, ground)
+            save_over(folder / split / f"r_{view}{suffix}", *look(cameras, view), ground)
             frames.append({"file_path": f"./{split}/r_{view}", "rotation": 0.01, "transform_matrix": pose.tolist()})
         content = {"camera_angle_x": FIELD, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content), encoding="utf-8")
-        written[split] = cameras
-    return written
 
 
 def save_over(file: Path, color: np.ndarray, alpha: np.ndarray, ground: Ground) -> None:
@@ -132,7 +113,7 @@ def scenes(tmp_path_factory):
     for name in ("transparent", "white", "black", "jpeg"):
         folder = tmp_path_factory.mktemp(name)
         ground: Ground = "white" if name == "jpeg" else name  # type: ignore[assignment]
-        write_blender(folder, size=SIZE, train=6, others=1, ground=ground, suffix=".jpg" if name == "jpeg" else ".png")
+        write_blender(folder, ground, ".jpg" if name == "jpeg" else ".png")
         made[name] = folder
     return made
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scene_files import some_gaussians
 from scipy.spatial.transform import Rotation
+from splats import front_camera
 
 from gsencoder.data.enclosure import (
     MIN_GAUSSIANS,
@@ -18,7 +19,7 @@ from gsencoder.data.enclosure import (
 from gsencoder.data.seeding.points import flat_gaussians
 from gsencoder.data.up import with_up
 from gsencoder.fusion.cameras import with_views
-from gsencoder.types import Cameras, Gaussians, Scene, Views
+from gsencoder.types import Gaussians, Scene, Views
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 BOARDS = {
@@ -71,9 +72,8 @@ def moved(gaussians: Gaussians, number: int) -> Gaussians:
     quats = (rotation * Rotation.from_quat(gaussians.quats, scalar_first=True)).as_quat(scalar_first=True)
     means = size * rotation.apply(gaussians.means) + [3, -7, 20 * number]
     scales = size * gaussians.scales
-    return replace(
-        gaussians, means=means.astype(np.float32), quats=quats.astype(np.float32), scales=scales.astype(np.float32)
-    )
+    means, quats, scales = (array.astype(np.float32) for array in (means, quats, scales))
+    return replace(gaussians, means=means, quats=quats, scales=scales)
 
 
 def denser(gaussians: Gaussians) -> Gaussians:
@@ -155,13 +155,8 @@ def test_what_was_decided_is_said_and_an_object_has_no_up_of_its_own():
 def test_surfaces_of_gaussians_are_their_thin_axes_and_areas_count_opacity():
     rotations = Rotation.random(3, random_state=0)
     scales = np.array([[0.01, 0.2, 0.3], [0.2, 0.01, 0.5], [0.2, 0.3, 0.11]], np.float32)
-    some = Gaussians(
-        means=np.arange(9, dtype=np.float32).reshape(3, 3),
-        quats=rotations.as_quat(scalar_first=True).astype(np.float32),
-        scales=scales,
-        opacities=np.array([0.5, 1.0, 1.0], np.float32),
-        sh=np.zeros((3, 1, 3), np.float32),
-    )
+    some = some_gaussians(np.arange(9.0).reshape(3, 3), np.array([0.5, 1.0, 1.0]))
+    some = replace(some, quats=rotations.as_quat(scalar_first=True).astype(np.float32), scales=scales)
     surfaces = surfaces_of_gaussians(some)
     order = np.argsort(surfaces.means[:, 0])
     # The third is thicker than half of its middle axis.
@@ -175,12 +170,7 @@ def test_surfaces_of_gaussians_are_their_thin_axes_and_areas_count_opacity():
 def test_areas_of_depth_samples_are_those_of_the_surfaces():
     """Of a plane across the view, seen by all pixels, z² / (fx fy) each; of a slanted one more by its cosine."""
     width, height, focal = 64, 48, 60.0
-    cameras = Cameras(
-        cam_from_world=np.eye(4, dtype=np.float32)[None],
-        Ks=np.array([[[focal, 0, 32], [0, focal, 24], [0, 0, 1]]], np.float32),
-        widths=np.array([width], np.int32),
-        heights=np.array([height], np.int32),
-    )
+    cameras = front_camera(width, height, focal)
     columns = np.tile((np.arange(width) + 0.5 - 32) / focal, (height, 1))
     for slope in (0.0, 1.0):
         depth = (2 / (1 - slope * columns)).astype(np.float32)

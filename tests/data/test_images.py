@@ -104,9 +104,8 @@ def bomb(width: int, height: int) -> bytes:
         return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
 
     header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([8, 2, 0, 0, 0])
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
-    )
+    chunks = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0" * 100)), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
 @pytest.mark.parametrize("size", [(9000, 9000), (2**31 - 1, 2**31 - 1)])
@@ -141,12 +140,8 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path):
     np.save(tmp_path / "cube.npy", np.zeros((24, 32, 2)))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object), allow_pickle=True)
     np.save(tmp_path / "huge.npy", np.full((24, 32), 1e300))
-    for name, problem in (
-        ("negative", "negative"),
-        ("cube", r"\[H, W\]"),
-        ("pickle", "readable"),
-        ("huge", "depth scale"),
-    ):
+    problems = {"negative": "negative", "cube": r"\[H, W\]", "pickle": "readable", "huge": "depth scale"}
+    for name, problem in problems.items():
         with pytest.raises(InputError, match=f"{name}.npy.*{problem}"):
             DepthFiles([with_depth(tmp_path / f"{name}.npy")], [grid()])[0]
     # A header that claims more than the file holds.
@@ -295,8 +290,8 @@ MODELS = {
 }
 
 
-def model(name: str, width: int = 720, height: int = 540) -> CameraModel:
-    return CameraModel(model=name, width=width, height=height, params=tuple(map(float, MODELS[name])))
+def model(name: str, *params: float, width: int = 720, height: int = 540) -> CameraModel:
+    return CameraModel(model=name, width=width, height=height, params=tuple(map(float, params or MODELS[name])))
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -320,19 +315,15 @@ def test_every_invertible_model_maps_pinhole_pixels_to_their_rays(name):
 
 def test_a_straight_camera_is_not_resampled():
     for name, params in (("OPENCV", (600, 600, 360, 270, 0, 0, 0, 0)), ("SIMPLE_RADIAL", (600, 360, 270, 0))):
-        camera = CameraModel(model=name, width=720, height=540, params=tuple(map(float, params)))
+        camera = model(name, *params)
         assert camera.is_pinhole
         assert remap_between(pinhole_for(camera, "test"), camera) is None
     assert not model("SIMPLE_FISHEYE").is_pinhole
 
 
 def test_a_folding_polynomial_keeps_only_its_innermost_rays():
-    camera = CameraModel(
-        model="OPENCV", width=720, height=540, params=(420.0, 420.0, 360.0, 270.0, -0.5, 0.0, 0.0, 0.0)
-    )
-    remap = remap_between(
-        CameraModel(model="PINHOLE", width=720, height=540, params=(420.0, 420.0, 360.0, 270.0)), camera
-    )
+    pinhole = (420, 420, 360, 270)
+    remap = remap_between(model("PINHOLE", *pinhole), model("OPENCV", *pinhole, -0.5, 0, 0, 0))
     y, x = np.mgrid[:540, :720] + 0.5
     radius = np.hypot(x - 360, y - 270) / 420
     fold = np.sqrt(1 / 1.5)
@@ -342,7 +333,7 @@ def test_a_folding_polynomial_keeps_only_its_innermost_rays():
 
 def test_pixels_without_content_are_black_and_masked(tmp_path):
     # A pincushion so strong that no zoom covers the corners.
-    camera = CameraModel(model="SIMPLE_RADIAL", width=720, height=540, params=(400.0, 360.0, 270.0, 0.7))
+    camera = model("SIMPLE_RADIAL", 400, 360, 270, 0.7)
     path = save(tmp_path / "white.png", np.full((540, 720, 3), 255, np.uint8))
     g = PixelGrid(source=camera, pinhole=pinhole_for(camera, "test"), width=720, height=540)
     image = ImageFiles([path], [g])[0]
@@ -360,17 +351,14 @@ def test_pixels_without_content_are_black_and_masked(tmp_path):
 @pytest.mark.parametrize(
     ("camera", "problem"),
     [
-        (CameraModel(model="EQUIRECTANGULAR", width=720, height=360, params=(720.0, 360.0)), "EQUIRECTANGULAR"),
-        (
-            CameraModel(model="OPENCV", width=720, height=540, params=(60.0, 60.0, 360.0, 270.0, -2.0, 0.0, 0.0, 0.0)),
-            "inverted on only",
-        ),
-        (CameraModel(model="PINHOLE", width=720, height=540, params=(20.0, 20.0, 360.0, 270.0)), "170°"),
-        (CameraModel(model="PINHOLE", width=720, height=540, params=(-1.0, 20.0, 360.0, 270.0)), "focal length"),
-        (CameraModel(model="PINHOLE", width=720, height=540, params=(float("nan"), 20.0, 360.0, 270.0)), "finite"),
-        (CameraModel(model="PINHOLE", width=720, height=540, params=(1e8, 1e8, 360.0, 270.0)), "is not a camera's"),
-        (CameraModel(model="PINHOLE", width=0, height=540, params=(500.0, 500.0, 360.0, 270.0)), "picture size"),
-        (CameraModel(model="OPENCV", width=720, height=540, params=(500.0, 500.0, 360.0, 270.0, 0.1)), "do not fit"),
+        (model("EQUIRECTANGULAR", 720, 360, height=360), "EQUIRECTANGULAR"),
+        (model("OPENCV", 60, 60, 360, 270, -2, 0, 0, 0), "inverted on only"),
+        (model("PINHOLE", 20, 20, 360, 270), "170°"),
+        (model("PINHOLE", -1, 20, 360, 270), "focal length"),
+        (model("PINHOLE", np.nan, 20, 360, 270), "finite"),
+        (model("PINHOLE", 1e8, 1e8, 360, 270), "is not a camera's"),
+        (model("PINHOLE", 500, 500, 360, 270, width=0), "picture size"),
+        (model("OPENCV", 500, 500, 360, 270, 0.1), "do not fit"),
     ],
 )
 def test_cameras_that_cannot_be_undistorted_are_named_errors(camera, problem):

@@ -15,7 +15,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.rgbd import read_scannet
 from gsencoder.data.scenes import find_scenes, layout_of, load_scene
 from gsencoder.data.synthetic import make_room
-from gsencoder.types import Scene, Views
+from gsencoder.types import Scene
 from gsencoder.types.scene import OPENCV_FROM_OPENGL
 
 Poses = Literal["colmap", "nerfstudio", "arkit"]
@@ -68,10 +68,6 @@ def write_iphone(scene: Scene, folder: Path, poses: Poses, *, prefix: str = "") 
     return iphone
 
 
-def views_of(scene: Scene) -> Views:
-    return scene.views
-
-
 @pytest.mark.parametrize(
     ("poses", "prefix"), [("colmap", ""), ("colmap", "iphone/"), ("nerfstudio", ""), ("arkit", "")]
 )
@@ -83,7 +79,7 @@ def test_a_room_is_read_back_from_each_kind_of_poses(room, tmp_path, poses, pref
         assert recognized.name == "ScanNet++"
     assert find_scenes([tmp_path]) == (folder,)
     read = load_scene(folder)
-    ours, theirs = views_of(read), views_of(room)
+    ours, theirs = read.views, room.views
     np.testing.assert_allclose(ours.cameras.cam_from_world, theirs.cameras.cam_from_world, atol=1e-5)
     np.testing.assert_allclose(ours.cameras.Ks, theirs.cameras.Ks, rtol=1e-6)
     for view in range(4):
@@ -95,8 +91,11 @@ def test_a_room_is_read_back_from_each_kind_of_poses(room, tmp_path, poses, pref
     assert (read.sfm_points is not None) == (poses == "colmap")
 
 
-def test_a_video_that_is_still_to_be_extracted_is_named_with_the_command(room, tmp_path):
+def test_streams_that_are_still_to_be_extracted_are_named_with_the_command(room, tmp_path):
     iphone = write_iphone(room, tmp_path / "scene", "colmap")
+    shutil.rmtree(iphone / "depth")
+    with pytest.warns(SceneWarning, match=r"depth.bin is still to be extracted to depth/"):
+        assert load_scene(iphone).views.depths is None
     shutil.rmtree(iphone / "rgb")
     with pytest.raises(InputError, match=r"extracted from rgb.mkv to rgb/ .* ffmpeg -i rgb.mkv -start_number 0"):
         load_scene(tmp_path / "scene")
@@ -109,13 +108,6 @@ def test_a_video_that_is_still_to_be_extracted_is_named_with_the_command(room, t
         load_scene(tmp_path / "scene")
 
 
-def test_a_depth_stream_that_is_still_to_be_extracted_is_said(room, tmp_path):
-    iphone = write_iphone(room, tmp_path / "scene", "colmap")
-    shutil.rmtree(iphone / "depth")
-    with pytest.warns(SceneWarning, match=r"depth.bin is still to be extracted to depth/"):
-        assert views_of(load_scene(iphone)).depths is None
-
-
 def test_frames_without_a_pose_or_depth_are_counted(room, tmp_path):
     iphone = write_iphone(room, tmp_path / "scene", "arkit")
     path = iphone / "pose_intrinsic_imu.json"
@@ -125,7 +117,7 @@ def test_frames_without_a_pose_or_depth_are_counted(room, tmp_path):
     path.write_text(json.dumps(content))
     (iphone / "depth/frame_000020.png").unlink()
     with pytest.warns(SceneWarning) as caught:
-        assert views_of(load_scene(iphone)).names == ("frame_000020.jpg", "frame_000030.jpg")
+        assert load_scene(iphone).views.names == ("frame_000020.jpg", "frame_000030.jpg")
     messages = " ".join(str(warning.message) for warning in caught)
     assert "1 of 4 frames are not in pose_intrinsic_imu.json and are left out (first: 'frame_000000.jpg')" in messages
     assert "1 of 4 frames lost tracking" in messages
@@ -140,9 +132,12 @@ def test_poses_that_are_none_are_refused(room, tmp_path, broken):
         load_scene(iphone)
 
 
-def test_depth_is_metres_and_the_world_is_upright(tmp_path):
+def test_depth_is_metres_the_world_is_upright_and_instances_are_read(tmp_path):
     write_scannet(tmp_path, 12)
+    save(tmp_path / "instance-filt/1.png", np.full((24, 32), 9, np.uint8))
     scene = load_scene(tmp_path)
+    assert (scene.views.instances[1] == 9).all()
+    assert not scene.views.instances[0].any()
     assert scene.metres_per_unit == 1.0
     assert scene.up.tolist() == [0, 0, 1]
     assert scene.views.names[9:] == ("color/9.png", "color/10.png", "color/11.png")
@@ -150,13 +145,11 @@ def test_depth_is_metres_and_the_world_is_upright(tmp_path):
 
 
 def test_depth_of_another_size_is_resampled_by_its_own_intrinsics(tmp_path):
-    factor = 2
-    write_scannet(tmp_path, depth_size=(32 * factor, 24 * factor))
-    views = load_scene(tmp_path).views
-    depth = views.depths[0]
+    write_scannet(tmp_path, depth_size=(64, 48))
+    depth = load_scene(tmp_path).views.depths[0]
     assert depth.shape == (24, 32)
-    # The center of color pixel c is the edge between depth pixels at factor·(c + ½), up to float rounding.
-    wanted = 1 + (np.arange(32) + 0.5) * factor * 1e-3
+    # The center of color pixel c is the edge between depth pixels at 2·(c + ½), up to float rounding.
+    wanted = 1 + (np.arange(32) + 0.5) * 2e-3
     assert np.abs(depth - wanted).max() <= 1.01e-3
 
 
@@ -178,14 +171,6 @@ def test_lost_and_unposed_frames_are_counted(tmp_path):
         np.savetxt(tmp_path / f"pose/{i}.txt", np.full((4, 4), -np.inf))
     with pytest.raises(InputError, match="no view"):
         load_scene(tmp_path)
-
-
-def test_instances_are_read_where_they_are(tmp_path):
-    write_scannet(tmp_path)
-    save(tmp_path / "instance-filt/1.png", np.full((24, 32), 9, np.uint8))
-    views = load_scene(tmp_path).views
-    assert (views.instances[1] == 9).all()
-    assert not views.instances[0].any()
 
 
 def test_bad_exports_are_errors_that_name_the_file(tmp_path):

@@ -9,7 +9,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.images import register_depth
 from gsencoder.data.scenes import LAYOUTS, SceneConfig, find_scenes, layout_of, load_scene
 from gsencoder.data.synthetic import make_room
-from gsencoder.types import Scene, Views
+from gsencoder.types import Scene
 
 
 @pytest.fixture(scope="module")
@@ -24,10 +24,6 @@ def options_for(layout: str, room: Scene) -> SceneConfig:
     return SceneConfig(intrinsics=stated)
 
 
-def views_of(scene: Scene) -> Views:
-    return scene.views
-
-
 @pytest.mark.parametrize("layout", WRITERS)
 def test_a_room_is_read_back_from_every_layout(room, tmp_path, layout):
     folder = tmp_path / "room"
@@ -37,13 +33,11 @@ def test_a_room_is_read_back_from_every_layout(room, tmp_path, layout):
     assert recognized.name == layout
     assert find_scenes([tmp_path]) == (folder,)
     read = load_scene(folder, options=options_for(layout, room))
-    ours, theirs = views_of(read), views_of(room)
+    ours, theirs = read.views, room.views
     assert len(ours) == len(theirs)
     shift = room.origin - read.origin
     np.testing.assert_allclose(ours.cameras.centers, theirs.cameras.centers + shift, atol=2e-6)
-    np.testing.assert_allclose(
-        ours.cameras.cam_from_world[:, :3, :3], theirs.cameras.cam_from_world[:, :3, :3], atol=1e-6
-    )
+    np.testing.assert_allclose(*(views.cameras.cam_from_world[:, :3, :3] for views in (ours, theirs)), atol=1e-6)
     np.testing.assert_allclose(ours.cameras.Ks, theirs.cameras.Ks, rtol=1e-6)
     for view in range(len(theirs)):
         np.testing.assert_array_equal(ours.images[view], theirs.images[view])
@@ -67,8 +61,10 @@ def test_the_error_that_recognizes_nothing_lists_every_layout(tmp_path):
         assert layout.files in str(error.value)
 
 
-def test_times_that_do_not_match_are_refused_with_both_ranges(room, tmp_path):
+def test_intrinsics_that_are_missing_and_times_that_do_not_match_are_refused(room, tmp_path):
     write_tum(room, tmp_path)
+    with pytest.raises(InputError, match=r"give data.intrinsics=\[fx,fy,cx,cy\]"):
+        load_scene(tmp_path)
     text = (tmp_path / "groundtruth.txt").read_text().replace("13050311", "13050399")
     (tmp_path / "groundtruth.txt").write_text(text)
     with pytest.raises(InputError, match=r"no view: rgb.txt has times from 1305031102.000 to"):
@@ -78,13 +74,7 @@ def test_times_that_do_not_match_are_refused_with_both_ranges(room, tmp_path):
 def test_depth_of_another_time_is_not_taken(room, tmp_path):
     write_tum(room, tmp_path, late=5.0)
     with pytest.warns(SceneWarning, match="5 of 5 depth files are missing"):
-        assert views_of(load_scene(tmp_path, options=options_for("TUM RGB-D", room))).depths is None
-
-
-def test_a_sequence_that_does_not_say_its_intrinsics_asks_for_them(room, tmp_path):
-    write_tum(room, tmp_path)
-    with pytest.raises(InputError, match=r"give data.intrinsics=\[fx,fy,cx,cy\]"):
-        load_scene(tmp_path)
+        assert load_scene(tmp_path, options=options_for("TUM RGB-D", room)).views.depths is None
 
 
 @pytest.mark.parametrize("count", [0, 7])
@@ -103,8 +93,8 @@ def test_intrinsics_and_a_depth_sensor_beside_the_camera_can_be_stated(room, tmp
     folder = tmp_path / "room"
     write_replica(room, folder)
     aside = (1.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-    moved = views_of(load_scene(folder, options=SceneConfig(depth_from_color=aside)))
-    plain = views_of(load_scene(folder))
+    moved = load_scene(folder, options=SceneConfig(depth_from_color=aside)).views
+    plain = load_scene(folder).views
     K = plain.cameras.Ks[0].astype(float)
     transform = np.eye(4)
     transform[0, 3] = -0.1

@@ -92,14 +92,7 @@ def test_folders_of_pictures_are_there_once_and_damaged_files_are_named(tmp_path
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {"tokens": "a/b"},
-        {"tokens": 3},
-        {"pictures": []},
-        {"pictures": [3]},
-        {"pictures": [".."]},
-        {"pictures": ["a/b.png"]},
-    ],
+    [{"tokens": "a/b"}, {"tokens": 3}, *({"pictures": names} for names in ([], [3], [".."], ["a/b.png"]))],
 )
 def test_names_that_leave_the_folder_are_no_prompt(tmp_path, changes):
     row = {"key": "a", "text": "t", "pictures": ["x.png"], "tokens": "", "space": ""}

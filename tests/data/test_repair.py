@@ -102,16 +102,12 @@ def test_all_mends_everything_at_once_and_a_second_run_finds_nothing():
         assert np.array_equal(getattr(again, field), getattr(fixed, field))
 
 
-def test_an_unknown_fix_lists_the_names():
+def test_an_unknown_fix_lists_the_names_and_a_repair_that_leaves_nothing_is_an_error():
     for wrong in (["quat"], [], "quats"):
         with pytest.raises(InputError, match="nonfinite, quats, scales, opacities, huge, duplicates, floaters, or all"):
             repair_splat(samples.make_raw(9), wrong)
-
-
-def test_a_repair_that_leaves_nothing_is_an_error():
-    raw = put("means", list(range(9)), np.nan)(samples.make_raw(9))
     with pytest.raises(InputError, match="drop all 9"):
-        repair_splat(raw, ["nonfinite"])
+        repair_splat(put("means", list(range(9)), np.nan)(samples.make_raw(9)), ["nonfinite"])
 
 
 def test_rows_that_differ_in_one_bit_of_one_column_are_not_duplicates():
@@ -190,11 +186,8 @@ def test_values_that_were_stored_activated_are_said_and_converted(columns):
 
 def test_a_splat_as_it_should_be_has_no_odd_values():
     right = surface()
-    for good in (
-        right,
-        replace(right, means=right.means + np.array([4651.0, 5428.0, 100.0])),
-        surface(12, step=2.0, scale=1.3),
-    ):
+    far = replace(right, means=right.means + np.array([4651.0, 5428.0, 100.0]))
+    for good in (right, far, surface(12, step=2.0, scale=1.3)):
         assert inspect_splat(good).findings == ()
     # Of large Gaussians logarithms are positive, too.
     large = replace(right, means=300 * right.means, log_scales=right.log_scales + np.float32(np.log(300)))
@@ -236,9 +229,8 @@ def posed(count: int = 4, **changes: Any) -> PosedImages:
         pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
         pose[:3, 3] = view, 2, 3
         image = {"depth": Path(f"/d/{view}.png"), "depth_scale": 1e-3} | changes
-        images.append(
-            PosedImage(name=f"{view}.png", camera=PINHOLE, cam_from_world=pose, image=Path(f"/c/{view}.png"), **image)
-        )
+        files = {"name": f"{view}.png", "image": Path(f"/c/{view}.png")}
+        images.append(PosedImage(camera=PINHOLE, cam_from_world=pose, **files, **image))
     return PosedImages(source="here", images=tuple(images), metres_per_unit=0.5, up=np.array([0.0, 1, 0]))
 
 
@@ -297,9 +289,8 @@ def test_a_color_camera_beside_the_depth_camera_leaves_the_depth_where_it_was():
     repaired, changes = repair_posed(right, [finding("color registration", factor=0.9)], fit)
     for mended, image in zip(repaired.images, right.images, strict=True):
         np.testing.assert_allclose(mended.depth_from_color @ mended.cam_from_world, image.cam_from_world, atol=1e-12)
-        np.testing.assert_allclose(
-            mended.cam_from_world[:3, 3] - image.cam_from_world[:3, 3], (0.02, -0.01, 0), atol=1e-12
-        )
+        moved = mended.cam_from_world - image.cam_from_world
+        np.testing.assert_allclose(moved[:3, 3], (0.02, -0.01, 0), atol=1e-12)
         assert mended.depth_camera == PINHOLE
         assert mended.camera.params == pytest.approx((45.0, 45.9, 32.0, 24.0))
     assert "0.0224 units" in changes[0]

@@ -7,14 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from scene_files import (
-    photograph,
-    rewrite,
-    save,
-    some_gaussians,
-    write_colmap,
-    write_transforms,
-)
+from scene_files import photograph, rewrite, save, some_gaussians, write_colmap, write_transforms
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.orbits import orbit_cameras, robust_ball

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import splat_samples as samples
+from scipy.special import expit
 
 from gsencoder.data.splats import files as splats
 from gsencoder.data.splats.files import fingerprint, load_splat, read_raw, save_splat
@@ -45,22 +46,19 @@ def test_we_read_what_open3d_writes(tmp_path, open3d, name):
     if name == "a.splat":  # open3d sorts the rows of a .splat by size and opacity.
         order = [int(np.abs(loaded.means - mean).sum(axis=1).argmin()) for mean in gaussians.means]
         loaded = loaded.select(np.array(order))
-    samples.assert_close(
-        loaded, gaussians, means=1.3e-4, quats=0.012, log_scales=0.0313, opacities=0.004, dc=0.015, rest=0.0
-    )
+    steps = {"means": 1.3e-4, "quats": 0.012, "log_scales": 0.0313, "opacities": 0.004, "dc": 0.015, "rest": 0.0}
+    samples.assert_close(loaded, gaussians, **steps)
 
 
-def assert_same_raw(ours: splats.RawSplat, theirs: object, opacity: float) -> None:
+def assert_same_raw(ours: splats.RawSplat, theirs: Any, opacity: float) -> None:
     """`theirs` is a gsply.GSData; gsply holds logits of packed files to ±10 or ±13.8, so opacities are compared."""
-    assert np.abs(ours.means - theirs.means).max() < 5e-6  # type: ignore[attr-defined]
-    assert np.abs(ours.quats - theirs.quats).max() < 5e-6  # type: ignore[attr-defined]
-    assert np.abs(ours.log_scales - theirs.scales).max() < 5e-6  # type: ignore[attr-defined]
-    logits = theirs.opacities.astype(np.float64).reshape(-1)  # type: ignore[attr-defined]
-    assert (
-        np.abs(1 / (1 + np.exp(-ours.logit_opacities.astype(np.float64))) - 1 / (1 + np.exp(-logits))).max() < opacity
-    )
-    assert np.abs(ours.sh[:, 0] - theirs.sh0).max() < 1e-6  # type: ignore[attr-defined]
-    rest = theirs.shN  # type: ignore[attr-defined]
+    assert np.abs(ours.means - theirs.means).max() < 5e-6
+    assert np.abs(ours.quats - theirs.quats).max() < 5e-6
+    assert np.abs(ours.log_scales - theirs.scales).max() < 5e-6
+    opacities = [expit(each.astype(np.float64).ravel()) for each in (ours.logit_opacities, theirs.opacities)]
+    assert np.abs(opacities[0] - opacities[1]).max() < opacity
+    assert np.abs(ours.sh[:, 0] - theirs.sh0).max() < 1e-6
+    rest = theirs.shN
     assert np.array_equal(ours.sh[:, 1:], rest if rest is not None else np.empty((len(ours), 0, 3), np.float32))
 
 

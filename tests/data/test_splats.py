@@ -21,8 +21,6 @@ from gsencoder.data.splats.files import fingerprint, load_splat, read_raw, save_
 from gsencoder.data.splats.repair import inspect_splat
 
 C0 = 0.28209479177387814
-
-
 SPZ = {"quats": 2e-3, "log_scales": 0.03126, "opacities": 0.00197, "dc": 0.01308, "rest": 0.00391}
 
 
@@ -57,16 +55,9 @@ def test_a_compressed_ply_in_order_comes_back_within_the_steps_of_each_chunk(tmp
         spans = [np.broadcast_to(np.ptp(chunk, axis=0), chunk.shape) for chunk in chunks]
         return np.concatenate(spans) / levels * 0.51 + 1e-6
 
-    samples.assert_close(
-        loaded,
-        gaussians,
-        means=half_steps(gaussians.means, 1023),
-        quats=2e-3,
-        log_scales=half_steps(np.log(gaussians.scales), 1023),
-        opacities=0.00197,
-        dc=half_steps(gaussians.sh[:, 0], 255),
-        rest=1 / 64 + 1e-6,
-    )
+    means, log_scales = (half_steps(values, 1023) for values in (gaussians.means, np.log(gaussians.scales)))
+    steps = {"means": means, "log_scales": log_scales, "dc": half_steps(gaussians.sh[:, 0], 255)}
+    samples.assert_close(loaded, gaussians, quats=2e-3, opacities=0.00197, rest=1 / 64 + 1e-6, **steps)
 
 
 def test_a_compressed_ply_is_reordered_into_compact_chunks_which_is_more_precise(tmp_path):
@@ -256,6 +247,8 @@ def sog_with(**changes: object) -> bytes:
 
 
 GOOD_PLY = samples.ply_bytes(samples.ply_columns(samples.make_raw(8, 1)))
+ASCII_PLY = samples.ply_bytes(samples.ply_columns(samples.make_raw(2, 0)), "ascii")
+SPZ3_BOMB = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 5_000_000, 0, 12, 0, 0) + bytes(100_000_000), 9)
 BIG_WEBP = bytes(imagecodecs.webp_encode(np.zeros((4000, 4000, 4), np.uint8), lossless=True))
 HOSTILE = {
     "empty.ply": (b"", "empty"),
@@ -270,14 +263,8 @@ HOSTILE = {
     "rest.ply": (GOOD_PLY.replace(b"f_rest_8", b"other_8"), "8 f_rest"),
     "twice.ply": (GOOD_PLY.replace(b"f_rest_8", b"f_rest_7"), "repeats a property"),
     "list.ply": (GOOD_PLY.replace(b"property float y", b"property list uchar int y"), "no element 'vertex' of plain"),
-    "ascii_huge.ply": (
-        samples.ply_bytes(samples.ply_columns(samples.make_raw(2, 0)), "ascii").replace(b"ex 2", b"ex 99999999999"),
-        "99,999,999,999 rows",
-    ),
-    "ascii_word.ply": (
-        samples.ply_bytes(samples.ply_columns(samples.make_raw(2, 0)), "ascii").replace(b"header\n", b"header\nx"),
-        "cannot be read",
-    ),
+    "ascii_huge.ply": (ASCII_PLY.replace(b"ex 2", b"ex 99999999999"), "99,999,999,999 rows"),
+    "ascii_word.ply": (ASCII_PLY.replace(b"header\n", b"header\nx"), "cannot be read"),
     "odd.splat": (bytes(33), "32-byte rows"),
     "version.spz": (struct.pack("<4sI24x", b"NGSP", 9), "version 9"),
     "streams.spz": (spz4(3, [(1, 1)] * 2), "expected 5 streams"),
@@ -288,10 +275,7 @@ HOSTILE = {
     "gzip.spz": (gzip.compress(b"something else"), "NGSP"),
     "gzip_cut.spz": (samples.spz2_bytes(np.zeros((5, 3)))[:-9], "truncated"),
     "gzip_bad.spz": (b"\x1f\x8b\x08" + b"\xff" * 50, "gzip data"),
-    "bomb3.spz": (
-        gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 5_000_000, 0, 12, 0, 0) + bytes(100_000_000), 9),
-        "exhaust memory",
-    ),
+    "bomb3.spz": (SPZ3_BOMB, "exhaust memory"),
     "zip_cut.sog": (samples.zipped(samples.sog_files())[:-30], "damaged"),
     "no_meta.sog": (samples.zipped({"a": b"b"}), "no member 'meta.json'"),
     "json.sog": (samples.zipped({"meta.json": b"{" * 100_000}), "not JSON"),

@@ -215,16 +215,9 @@ def test_a_frame_that_cannot_be_used_is_named(tmp_path, values, problem):
     assert len(str(caught.value)) < 1000
 
 
-@pytest.mark.parametrize(
-    ("top", "problem"),
-    [
-        ({"up": [0, 0, 0]}, "up must be"),
-        ({"up": [1, 0]}, "up must be"),
-        ({"metres_per_unit": 0}, "metres_per_unit must be positive"),
-    ],
-)
-def test_an_up_or_a_unit_that_is_none_is_refused(tmp_path, top, problem):
-    with pytest.raises(InputError, match=problem):
+@pytest.mark.parametrize("top", [{"up": [0, 0, 0]}, {"up": [1, 0]}, {"metres_per_unit": 0}])
+def test_an_up_or_a_unit_that_is_none_is_refused(tmp_path, top):
+    with pytest.raises(InputError, match=f"{next(iter(top))} must be"):
         read_transforms(rewrite(tmp_path, write_transforms(tmp_path) | top))
 
 

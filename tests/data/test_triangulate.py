@@ -43,13 +43,14 @@ def test_parallel_cameras_look_ten_baselines_away_and_one_camera_one_unit():
     assert typical_distance(row.select([0, 0])) == 1.0
 
 
-def test_points_of_a_wall_lie_on_it():
+def test_points_of_a_wall_lie_on_it_and_masked_pixels_give_none():
     points, colors = triangulate(wall_views(4))
     assert len(points) > 20
     assert np.median(off_wall(points)) < 0.05
     again = triangulate(wall_views(4))
     np.testing.assert_array_equal(points, again[0])
     np.testing.assert_array_equal(colors, again[1])
+    assert not len(triangulate(replace(wall_views(4), masks=[np.zeros((72, 96), bool)] * 4))[0])
 
 
 def test_photographs_that_do_not_fit_their_poses_are_warned_of():
@@ -59,12 +60,6 @@ def test_photographs_that_do_not_fit_their_poses_are_warned_of():
     wrong = replace(views, cameras=replace(views.cameras, cam_from_world=poses))
     with pytest.warns(SceneWarning, match=r"do not seem to fit their poses: of [0-9,]+ matched features [0-9]+ lie on"):
         triangulate(wrong)
-
-
-def test_masked_pixels_give_no_points():
-    views = wall_views(4)
-    masks = [np.zeros((int(h), int(w)), bool) for h, w in zip(views.cameras.heights, views.cameras.widths, strict=True)]
-    assert not len(triangulate(replace(views, masks=masks))[0])
 
 
 def test_a_scene_without_depth_and_points_is_seeded_from_its_photographs():
@@ -78,18 +73,15 @@ def test_a_scene_without_depth_and_points_is_seeded_from_its_photographs():
     assert choose_source(scene, SeedConfig(source="depth")) == "depth"
 
 
-def test_views_that_look_away_from_each_other_are_refused(no_jaxtyping):
+def test_one_photograph_and_views_that_look_away_from_each_other_are_refused(no_jaxtyping):
+    with pytest.raises(InputError, match="1 photograph without depth and points says nothing about where surfaces are"):
+        seed(Scene(name="one", views=wall_views(1)), SeedConfig(source="photographs"))
     views = wall_views(4)
     turns = np.pi / 2 * np.arange(4)
     outward = np.stack((np.cos(turns), np.sin(turns), np.zeros(4)), axis=1)
     away = looking_cameras(3 * outward, outward, np.array([0.0, 0, 1]), width=96, height=72, focal=80.0)
     with pytest.raises(InputError, match="no two of the 4 photographs show the same surface from different places"):
         seed_from_photographs(replace(views, cameras=away))
-
-
-def test_one_photograph_is_refused():
-    with pytest.raises(InputError, match="1 photograph without depth and points says nothing about where surfaces are"):
-        seed(Scene(name="one", views=wall_views(1)), SeedConfig(source="photographs"))
 
 
 @pytest.mark.slow
@@ -131,10 +123,8 @@ def test_depths_agree_where_they_are_true_and_nowhere_else():
     photographs = Photographs(wall_views())
     photos = [photographs.at_scale(view) for view in range(3)]
     truths = [torch.from_numpy(seen(cameras(), view)[1]) for view in range(3)]
-    others = [
-        (DepthMap(truths[view], torch.ones_like(truths[view]), truths[view]), photos[view], pose(view))
-        for view in (0, 2)
-    ]
+    maps = [DepthMap(truth, torch.ones_like(truth), truth) for truth in truths]
+    others = [(maps[view], photos[view], pose(view)) for view in (0, 2)]
     votes = count_agreeing(truths[1], photos[1], pose(1), others, 0.02)
     assert (votes[:, 16:-16] == 2).all()
     assert (count_agreeing(1.1 * truths[1], photos[1], pose(1), others, 0.02) == 0).all()

@@ -10,6 +10,7 @@ from field_scenes import FieldRoom, cam_from_world, store_turned, write_colmap_t
 from PIL import Image, ImageOps
 from scene_files import photograph
 from scipy.spatial.transform import Rotation
+from splats import front_camera, gaussians_at
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.core.errors import InputError, SceneWarning
@@ -27,7 +28,7 @@ from gsencoder.infer.views.pictures import view_pictures
 from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.teachers.labels import PaletteTeacher
 from gsencoder.teachers.masks import FileMasks
-from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 from gsencoder.types.orientation import INVERSE, TURNS, turned, upright_scene, upright_views
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -38,23 +39,16 @@ def room():
     return replace(make_room(1, objects=6, views=10, width=96, height=72, spacing=0.08), up=None)
 
 
-def turned_cameras(cameras: Cameras, rotation: np.ndarray) -> Cameras:
-    poses = cameras.cam_from_world.astype(np.float64)
-    poses[:, :3, :3] = poses[:, :3, :3] @ rotation.T
-    return replace(cameras, cam_from_world=poses.astype(np.float32))
-
-
 def turned_by(scene: Scene, rotation: np.ndarray) -> Scene:
     gaussians, views = scene.gaussians, scene.views
     if gaussians is not None:
         quats = Rotation.from_matrix(rotation) * Rotation.from_quat(gaussians.quats, scalar_first=True)
-        gaussians = replace(
-            gaussians,
-            means=(gaussians.means @ rotation.T).astype(np.float32),
-            quats=quats.as_quat(scalar_first=True).astype(np.float32),
-        )
+        means = (gaussians.means @ rotation.T).astype(np.float32)
+        gaussians = replace(gaussians, means=means, quats=quats.as_quat(scalar_first=True).astype(np.float32))
     if views is not None:
-        views = replace(views, cameras=turned_cameras(views.cameras, rotation))
+        poses = views.cameras.cam_from_world.copy()
+        poses[:, :3, :3] = poses[:, :3, :3] @ rotation.T
+        views = replace(views, cameras=replace(views.cameras, cam_from_world=poses))
     return replace(scene, gaussians=gaussians, views=views)
 
 
@@ -78,14 +72,8 @@ def test_up_of_a_turned_room_turns_with_it(room):
 
 
 def test_a_camera_that_moves_ahead_has_the_mean_of_its_own_up():
-    poses = np.tile(np.eye(4, dtype=np.float32), (5, 1, 1))
-    poses[:, 2, 3] = np.arange(5)
-    ahead = Cameras(
-        cam_from_world=poses,
-        Ks=np.tile(np.array([[50, 0, 32], [0, 50, 24], [0, 0, 1]], np.float32), (5, 1, 1)),
-        widths=np.full(5, 64, np.int32),
-        heights=np.full(5, 48, np.int32),
-    )
+    ahead = front_camera(64, 48).select([0] * 5)
+    ahead.cam_from_world[:, 2, 3] = np.arange(5)
     np.testing.assert_allclose(up_of_cameras(ahead), (0, -1, 0), atol=1e-6)
 
 
@@ -100,13 +88,8 @@ def test_a_splat_without_directions_has_no_up():
     """Flat Gaussians that face everywhere, and round ones."""
     made = np.random.default_rng(0)
     count = 3000
-    ball = Gaussians(
-        means=made.normal(size=(count, 3)).astype(np.float32),
-        quats=Rotation.random(count, random_state=0).as_quat(scalar_first=True).astype(np.float32),
-        scales=np.tile(np.array([0.1, 0.1, 0.001], np.float32), (count, 1)),
-        opacities=np.full(count, 0.9, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-    )
+    quats = Rotation.random(count, random_state=0).as_quat(scalar_first=True).astype(np.float32)
+    ball = replace(gaussians_at(made.normal(size=(count, 3)), (0.1, 0.1, 0.001), 0.9), quats=quats)
     scene, up = with_up(Scene(name="ball", gaussians=ball))
     assert (scene.up, up) == (None, None)
     balls = replace(ball, scales=np.full((count, 3), 0.1, np.float32))
@@ -158,9 +141,7 @@ def test_the_side_of_a_bare_splat_with_the_floor_is_down():
     made = np.random.default_rng(0)
     floor = np.concatenate((made.uniform(-2, 2, (800, 2)), np.zeros((800, 1))), axis=1)
     ceiling = np.concatenate((made.uniform(-1, 1, (300, 2)), np.full((300, 1), 2.5)), axis=1)
-    wall = np.concatenate(
-        (np.full((400, 1), 2.0), made.uniform(-2, 2, (400, 1)), made.uniform(0, 2.5, (400, 1))), axis=1
-    )
+    wall = np.stack((np.full(400, 2.0), made.uniform(-2, 2, 400), made.uniform(0, 2.5, 400)), axis=1)
     means = np.concatenate((floor, ceiling, wall))
     normals = np.repeat([[0.0, 0, 1], [0, 0, 1], [1, 0, 0]], (800, 300, 400), axis=0)
     areas = np.full(1500, 1.0)
@@ -244,9 +225,7 @@ def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room):
     [((0, -1, 0), 0.06, True), ((0, -0.8, -0.6), 0.06, True), ((0, 0, 1), 0.06, False), ((0, -1, 0), 0.04, False),
      ((0, 0, 1), 0.11, True), ((0, 1, 0), 0.06, False)],
 )  # fmt: skip
-def test_surfaces_of_a_bare_splat_need_less_where_they_say_what_is_assumed_anyway(
-    monkeypatch, direction, confidence, used
-):
+def test_surfaces_of_a_bare_splat_need_less_where_they_say_what_is_assumed(monkeypatch, direction, confidence, used):
     estimate = Up(direction=np.array(direction, np.float64), confidence=confidence, source="surfaces")
     monkeypatch.setattr("gsencoder.data.up.up_of_scene", lambda scene: estimate)
     scene, up = with_up(Scene(name="bare"))
@@ -258,15 +237,11 @@ PORTRAIT, LANDSCAPE = "PINHOLE 120 160 112 112 60 80", "PINHOLE 160 120 112 112 
 MIXED = (6, 1, 8, 3, 6, 8, 1, 3)
 
 
-def camera_of(orientation: int) -> str:
-    return PORTRAIT if orientation > 4 else LANDSCAPE
-
-
 def turned_scene(field_room: FieldRoom, folder: Path, orientations: tuple[int, ...]) -> tuple[Path, list[np.ndarray]]:
     """The room as COLMAP registers photographs that are stored turned, and the poses of their stored pixels."""
     content = field_room.copy_photographs(folder)
     poses = store_turned(folder, content, orientations)
-    cameras = [camera_of(orientation) for orientation in orientations]
+    cameras = [PORTRAIT if orientation > 4 else LANDSCAPE for orientation in orientations]
     return write_colmap_text(folder, content, camera=cameras, poses=poses), poses
 
 

@@ -73,9 +73,7 @@ def test_poses_of_a_scene_are_taken_as_they_are(posed: Path, work: Path, monkeyp
     assert opened.seconds == {}
 
 
-def test_photographs_are_placed_by_several_cameras_and_frames_of_a_video_by_one(
-    photographs: Path, work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_are_placed_by_cameras_and_frames_of_a_video_by_one(photographs, work, tmp_path, monkeypatch):
     placing = Placing(monkeypatch)
     opened = open_scene(photographs, work)
     assert (opened.sfm, opened.photographs, opened.is_video) == (placing.placed, photographs, False)
@@ -90,9 +88,7 @@ def test_photographs_are_placed_by_several_cameras_and_frames_of_a_video_by_one(
     assert placing.calls == [(photographs, False), (work / FRAMES_FOLDER, True)]
 
 
-def test_links_that_lead_out_of_the_folder_are_refused_before_photographs_are_placed(
-    photographs: Path, work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_links_that_lead_out_are_refused_before_photographs_are_placed(photographs, work, tmp_path, monkeypatch):
     placing = Placing(monkeypatch)
     (photographs / "a.jpg").rename(tmp_path / "elsewhere.jpg")
     (photographs / "a.jpg").symlink_to(tmp_path / "elsewhere.jpg")

@@ -35,10 +35,8 @@ def save_words(folder: Path) -> None:
 def save_letters(folder: Path) -> None:
     """The tokenizer of SigLIP2, with letters for tokens."""
     letters = ("<pad>", "<eos>", "<bos>", "<unk>", "<mask>", "▁", *"abcdefghijklmnopqrstuvwxyz")
-    tokenizer = transformers.Siglip2Tokenizer(
-        vocab={letter: row for row, letter in enumerate(letters)}, merges=[], model_max_length=12
-    )
-    tokenizer.save_pretrained(folder)
+    vocab = {letter: row for row, letter in enumerate(letters)}
+    transformers.Siglip2Tokenizer(vocab=vocab, merges=[], model_max_length=12).save_pretrained(folder)
 
 
 def clip() -> Any:
@@ -47,16 +45,13 @@ def clip() -> Any:
 
 
 def siglip() -> Any:
-    return transformers.SiglipModel(
-        transformers.SiglipConfig(text_config={**TEXT, "projection_size": 8}, vision_config=VISION)
-    )
+    config = transformers.SiglipConfig(text_config={**TEXT, "projection_size": 8}, vision_config=VISION)
+    return transformers.SiglipModel(config)
 
 
 def siglip2() -> Any:
-    vision = {**SMALL, "num_patches": 4, "patch_size": 4}
-    return transformers.Siglip2Model(
-        transformers.Siglip2Config(text_config={**TEXT, "vocab_size": 32, "projection_size": 8}, vision_config=vision)
-    )
+    text, vision = {**TEXT, "vocab_size": 32, "projection_size": 8}, {**SMALL, "num_patches": 4, "patch_size": 4}
+    return transformers.Siglip2Model(transformers.Siglip2Config(text_config=text, vision_config=vision))
 
 
 def bert() -> Any:

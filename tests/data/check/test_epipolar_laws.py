@@ -1,6 +1,8 @@
 """Matches of projected points, without photographs: distances from epipolar lines, readings, views astray, evidence."""
 
+from collections.abc import Iterable
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -37,11 +39,11 @@ def matches(cameras):
     """Points in the middle, seen by every view."""
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (60, 3)) + cameras.centers.mean(axis=0)
     pixels = cameras.project(points)[0].astype(np.float64)
-    return [
-        PairMatches(first=first, second=second, first_pixels=pixels[first], second_pixels=pixels[second])
-        for first in range(6)
-        for second in range(first + 1, 6)
-    ]
+    return pairs_of(pixels, combinations(range(6), 2))
+
+
+def pairs_of(pixels: np.ndarray, pairs: Iterable[tuple[int, int]]) -> list[PairMatches]:
+    return [PairMatches(first=a, second=b, first_pixels=pixels[a], second_pixels=pixels[b]) for a, b in pairs]
 
 
 def test_views_without_a_pair_that_fits_are_named_as_unmatched(cameras, matches):
@@ -100,9 +102,8 @@ def judged(cameras: Cameras, matches: list[PairMatches]) -> tuple[list[tuple[str
 
 def test_matches_of_one_point_lie_on_their_lines_and_errors_are_clipped(cameras, matches):
     assert max(mean_error(cameras, [pair]) for pair in matches) < 0.01
-    far = replace(
-        matches[0], second_pixels=matches[0].second_pixels + np.random.default_rng(0).normal(size=(60, 2)) * 1e4
-    )
+    noise = np.random.default_rng(0).normal(size=(60, 2)) * 1e4
+    far = replace(matches[0], second_pixels=matches[0].second_pixels + noise)
     assert 0.9 * CLIP < mean_error(cameras, [far]) <= CLIP
     assert mean_error(cameras, [far, matches[1]]) == pytest.approx(mean_error(cameras, [far]) / 2, abs=0.01)
 
@@ -124,10 +125,7 @@ def test_the_next_photographs_are_those_of_the_scene_and_not_of_the_views_that_w
     right, rows = box_cameras(9, width=320, height=240, focal=200.0), np.array([1, 3, 4, 7])
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (60, 3)) + right.centers.mean(axis=0)
     pixels = right.project(points)[0].astype(np.float64)[rows]
-    pairs = [
-        PairMatches(first=first, second=second, first_pixels=pixels[first], second_pixels=pixels[second])
-        for first, second in ((0, 1), (0, 2), (1, 2), (2, 3))
-    ]
+    pairs = pairs_of(pixels, ((0, 1), (0, 2), (1, 2), (2, 3)))
     wrong = with_poses(right, np.roll(right.cam_from_world, 1, axis=0))
     cause, places, best, error = _best_reading(wrong.select(rows), wrong, rows, pairs)
     assert (cause, places) == ("order", -1)
@@ -209,12 +207,8 @@ def test_a_pose_with_more_than_a_third_of_the_error_is_none_of_a_view_astray(cam
 def test_far_pairs_that_do_not_fit_accuse_nobody(cameras, matches):
     near = {(pair.first, pair.second) for pair in near_pairs(cameras, matches)}
     assert 3 <= len(near) < len(matches)
-    wallpaper = [
-        pair
-        if (pair.first, pair.second) in near
-        else replace(pair, second_pixels=pair.second_pixels + np.array([40, 25]))
-        for pair in matches
-    ]
+    moved = [replace(pair, second_pixels=pair.second_pixels + np.array([40, 25])) for pair in matches]
+    wallpaper = [a if (a.first, a.second) in near else b for a, b in zip(matches, moved, strict=True)]
     assert judged(cameras, wallpaper) == ([], True)
     assert judge_matches(wallpaper, cameras, cameras, np.arange(6), NAMES).error > 3
 
@@ -257,10 +251,8 @@ def test_poses_that_fit_nowhere_are_called_wrong_by_six_pairs_and_not_by_five(ca
     wrong = with_poses(cameras, poses)
     path = [pair for pair in matches if pair.second - pair.first == 1]
     assert judged(wrong, path) == ([], False)
-    assert judged(wrong, [*path, *(pair for pair in matches if (pair.first, pair.second) == (0, 5))]) == (
-        [("unknown", None)],
-        True,
-    )
+    (last,) = [pair for pair in matches if (pair.first, pair.second) == (0, 5)]
+    assert judged(wrong, [*path, last]) == ([("unknown", None)], True)
 
 
 def test_groups_of_three_neighbors_are_spread_over_all_views():

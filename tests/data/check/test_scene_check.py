@@ -102,11 +102,6 @@ def with_other_picture(views: Views) -> Views:
     return replace(views, images=images)
 
 
-def ray_lengths(views: Views) -> np.ndarray:
-    rays = views.cameras.rays(0)
-    return np.asarray(np.linalg.norm(rays, axis=2))
-
-
 def other_sensor(depth: np.ndarray, factor: float = 1.1) -> np.ndarray:
     """The depth image of a sensor with a longer focal length, as if it had the stated one."""
     height, width = depth.shape
@@ -123,7 +118,7 @@ POSE_FAULTS: dict[str, Callable[[Views], Views]] = {
 }
 DEPTH_FAULTS: dict[str, Callable[[Views], Views]] = {
     "depth scale": lambda views: with_depths(views, lambda depth: 1.03 * depth),
-    "ray length": lambda views: with_depths(views, lambda depth: depth * ray_lengths(views)),
+    "ray length": lambda views: with_depths(views, lambda depth: depth * np.linalg.norm(views.cameras.rays(0), axis=2)),
     "depth focal length": lambda views: with_depths(views, other_sensor),
 }
 VIEW_FAULTS: dict[str, Callable[[Views], Views]] = {"stray view": with_stray, "other picture": with_other_picture}
@@ -155,10 +150,8 @@ def test_a_view_that_is_wrong_alone_is_named(box, fault):
 
 def test_two_faults_at_once_are_both_named(box):
     check = check_depth(with_other_picture(POSE_FAULTS["inverse"](box)))
-    assert {(finding.cause, finding.view) for finding in check.findings} == {
-        ("inverse", None),
-        ("other picture", box.names[ROW]),
-    }
+    found = {(finding.cause, finding.view) for finding in check.findings}
+    assert found == {("inverse", None), ("other picture", box.names[ROW])}
 
 
 def test_photographs_of_a_camera_beside_the_depth_camera_are_not_registered():
@@ -271,12 +264,8 @@ def test_a_corner_cut_out_of_a_larger_picture_is_right_where_the_views_fit(box):
     Ks = box.cameras.Ks.copy()
     Ks[:, :2, 2] -= (56, 42)
     cameras = replace(box.cameras, Ks=Ks, widths=box.cameras.widths - 56, heights=box.cameras.heights - 42)
-    corner = replace(
-        box,
-        cameras=cameras,
-        images=[image[42:, 56:] for image in box.images],
-        depths=[depth[42:, 56:] for depth in box.depths],
-    )
+    images, depths = ([picture[42:, 56:] for picture in pictures] for pictures in (box.images, box.depths))
+    corner = replace(box, cameras=cameras, images=images, depths=depths)
     assert wrong_size(corner.cameras) is not None
     depth = check_depth(corner)
     assert depth.comparable
@@ -309,18 +298,11 @@ def small(views_of_box):
     return depth_views(views_of_box, np.arange(COUNT))
 
 
-def grey_of(views_of_box: Views) -> np.ndarray:
-    return np.stack([grey_picture(views_of_box, row, 96, 72) for row in range(COUNT)])
-
-
-def off_walls(points: np.ndarray) -> np.ndarray:
-    return np.asarray(np.abs(np.abs(points) - HALF).min(axis=-1))
-
-
 def test_samples_lie_where_the_depth_says_in_any_unit(small):
     known = small.values > 0
     assert known.sum(axis=1).max() == SAMPLES
-    assert off_walls(world_samples(small)[known]).max() < 1e-4
+    off_walls = np.abs(np.abs(world_samples(small)[known]) - HALF).min(axis=-1)
+    assert off_walls.max() < 1e-4
     millimeters = replace(small, depths=1000 * small.depths, values=1000 * small.values, scale=1e-3)
     np.testing.assert_allclose(world_samples(millimeters), world_samples(small), atol=1e-6)
     np.testing.assert_allclose(residuals(millimeters), residuals(small), atol=1e-6)
@@ -400,16 +382,15 @@ def test_shared_samples_are_one_place_in_the_axes_of_both_views(small):
     for view, other, here, there in pairs:
         assert view != other
         assert len(here) >= MIN_SAMPLES
-        np.testing.assert_allclose(
-            transform(world_from_cam[view], here), transform(world_from_cam[other], there), atol=1e-6
-        )
+        ours, theirs = transform(world_from_cam[view], here), transform(world_from_cam[other], there)
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
     most = max(len(here) for _, _, here, _ in pairs)
     assert len(list(shared_samples(small, most))) >= 1
     assert not list(shared_samples(small, most + 1))
 
 
 def test_colors_of_one_place_correlate_wherever_they_are_seen_from(views_of_box, small):
-    grey = grey_of(views_of_box)
+    grey = np.stack([grey_picture(views_of_box, row, 96, 72) for row in range(COUNT)])
     light = views_of_box.images[0].astype(float) @ (0.299, 0.587, 0.114) / 255
     np.testing.assert_allclose(grey[0], light, atol=0.01)
     known = color_correlations(small, grey, small.Ks)

@@ -4,6 +4,7 @@ import csv
 import json
 import pickle
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +48,12 @@ def entry(**changes: Any) -> dict[str, Any]:
     } | changes
 
 
-def written(folder: Path, content: Any) -> Path:
-    path = folder / "ScanRefer_filtered_val.json"
-    path.write_text(json.dumps(content), encoding="utf-8")
-    return path
+def written(folder: Path, content: Any, name: str = "ScanRefer_filtered_val.json") -> Path:
+    (folder / name).write_text(json.dumps(content), encoding="utf-8")
+    return folder / name
+
+
+scanqa = partial(written, name="ScanQA_v1.0_val.json")
 
 
 def nr3d(folder: Path, *rows: dict[str, str]) -> Path:
@@ -169,13 +172,9 @@ def write_scan(folder: Path, alignment: np.ndarray | None = ALIGNMENT) -> Path:
 def test_the_box_is_that_of_the_meant_objects_vertices_in_the_aligned_axes(tmp_path: Path) -> None:
     labels = read_scannet_labels(write_scan(tmp_path / "s0"))
     boxes = boxes_from_labels([meaning(2), meaning(0), meaning(1), meaning(5), meaning(2, aabb=STATED)], labels)
-    assert [each.aabb for each in boxes] == [
-        ((4.0, 1.0, 2.0), (8.0, 4.0, 7.0)),
-        ((10.0, 0.0, -1.0), (10.0, 0.0, -1.0)),
-        None,  # All of its vertices belong to object 5.
-        ((1.0, 7.0, 6.0), (3.0, 9.0, 8.0)),
-        STATED,
-    ]
+    # All vertices of object 1 belong to object 5.
+    expected = [((4, 1, 2), (8, 4, 7)), ((10, 0, -1), (10, 0, -1)), None, ((1, 7, 6), (3, 9, 8)), STATED]
+    assert [each.aabb for each in boxes] == expected
     assert [each.object_id for each in boxes] == [2, 0, 1, 5, 2]
     with pytest.raises(InputError, match="s0: its labels have no object with the objectId 3"):
         boxes_from_labels([meaning(3)], labels)
@@ -184,23 +183,13 @@ def test_the_box_is_that_of_the_meant_objects_vertices_in_the_aligned_axes(tmp_p
 def test_expressions_of_several_scans_stay_in_order_and_scans_that_nothing_needs_are_not_read(tmp_path: Path) -> None:
     write_scan(tmp_path / "s0")
     write_scan(tmp_path / "s1", alignment=None)
-    expressions = [
-        meaning(0, "s1"),
-        meaning(2, "s0"),
-        meaning(0, "nowhere", aabb=STATED),
-        meaning(2, "s1"),
-        meaning(0, "s0"),
-    ]
+    nowhere = meaning(0, "nowhere", aabb=STATED)
+    expressions = [meaning(0, "s1"), meaning(2, "s0"), nowhere, meaning(2, "s1"), meaning(0, "s0")]
     with pytest.warns(SceneWarning, match="axisAlignment"):
         boxes = boxes_from_scans(expressions, tmp_path)
     assert [(each.scene, each.object_id) for each in boxes] == [(each.scene, each.object_id) for each in expressions]
-    assert [each.aabb and each.aabb[0] for each in boxes] == [
-        (0.0, 0.0, 0.0),
-        (4.0, 1.0, 2.0),
-        (0.0, 0.0, 0.0),
-        (1.0, 2.0, 3.0),
-        (10.0, 0.0, -1.0),
-    ]
+    lower = [(0, 0, 0), (4, 1, 2), (0, 0, 0), (1, 2, 3), (10, 0, -1)]
+    assert [each.aabb and each.aabb[0] for each in boxes] == lower
     assert boxes_from_scans([], tmp_path) == ()
     with pytest.raises(InputError, match="nowhere: no annotation of ScanNet"):
         boxes_from_scans([meaning(0, "nowhere")], tmp_path)
@@ -245,12 +234,6 @@ def sqa3d(folder: Path, questions: list[Any], annotations: list[Any] | None) -> 
     if annotations is not None:
         other = folder / "v1_balanced_sqa_annotations_test_scannetv2.json"
         other.write_text(json.dumps({"info": {}, "annotations": annotations}))
-    return path
-
-
-def scanqa(folder: Path, content: Any) -> Path:
-    path = folder / "ScanQA_v1.0_val.json"
-    path.write_text(json.dumps(content))
     return path
 
 

@@ -69,13 +69,8 @@ def test_of_two_objects_with_one_segment_the_later_one_has_it_as_in_scannets_scr
     labels = read_scannet_labels(scan(tmp_path, groups=[group(0, "table", [9]), group(1, "book", [9])]))
     assert labels.objects == ((1, "table"), (2, "book"))
     assert list(labels.boxes()) == [2]
-
-
-def test_a_scan_without_objects_has_labels_that_are_all_none(tmp_path: Path) -> None:
-    labels = read_scannet_labels(scan(tmp_path, groups=[]))
-    assert labels.objects == ()
-    assert not labels.instances.any()
-    assert labels.boxes() == {}
+    nothing = read_scannet_labels(scan(tmp_path, groups=[]))
+    assert (nothing.objects, nothing.boxes(), nothing.instances.any()) == ((), {}, False)
 
 
 def test_files_are_found_in_the_folder_or_above_exported_frames(tmp_path: Path) -> None:
@@ -112,11 +107,6 @@ def test_meshes_of_every_encoding_keep_the_order_of_vertices(tmp_path: Path, tex
     write_ply(path, vertices, faces, text=text, order=order)
     with pytest.raises(InputError, match=r"face 1 names vertex -1 of 50"):
         read_mesh(path)
-
-
-def test_a_cloud_has_no_triangles(tmp_path: Path) -> None:
-    assert read_mesh(write_ply(tmp_path / "a.ply", VERTICES))[1] is None
-    assert read_mesh(write_ply(tmp_path / "b.ply", VERTICES, FACES[:0]))[1] is None
 
 
 def error_of(folder: Path) -> str:
@@ -176,7 +166,9 @@ def test_truncated_meshes_are_refused(tmp_path: Path, keep: int) -> None:
     assert str(path) in error_of(folder)
 
 
-def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
+def test_a_cloud_has_no_triangles_and_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
+    for number, faces in enumerate((None, FACES[:0])):
+        assert read_mesh(write_ply(tmp_path / f"{number}.ply", VERTICES, faces))[1] is None
     path = write_ply(tmp_path / "a.ply", VERTICES, FACES)
     good = path.read_bytes()
     for content in (b"PK\x03\x04", good.replace(b"element vertex 6", b"element vertex 9999999999")):
@@ -209,14 +201,8 @@ def test_of_overlapping_objects_of_scannetpp_the_smallest_has_the_vertex(tmp_pat
     # Four vertices of segment 1, two of 2, one of 3.
     segments = np.array([1, 1, 1, 1, 2, 2, 3])
     vertices = np.arange(21, dtype=np.float32).reshape(7, 3)
-    groups = [
-        group(5, "keyboard", [2]),
-        group(1, "table", [1, 2, 3]),
-        group(2, "mouse", [3]),
-        group(9, "tray", [2]),
-        group(7, "screen", [2]),
-    ]
-    folder = write_scannetpp_labels(tmp_path / "scene", vertices, segments, groups)
+    things = ((5, "keyboard", [2]), (1, "table", [1, 2, 3]), (2, "mouse", [3]), (9, "tray", [2]), (7, "screen", [2]))
+    folder = write_scannetpp_labels(tmp_path / "scene", vertices, segments, [group(*thing) for thing in things])
     labels = read_scannetpp_labels(folder)
     # Keyboard, tray and screen have two vertices each, and the first counts; screen would be the fourth on them.
     assert labels.instances.tolist() == [1, 1, 1, 1, 5, 5, 2]
@@ -310,40 +296,31 @@ def test_nothing_gives_no_labels(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sensor", "seen"),
+    ("depth", "drawn", "hidden"),
     [
-        # The mesh is at 4 m, where a twentieth of the sensor's depth is more than 0.1 m.
-        (0.0, True),
-        (4.21, True),
-        (4.22, False),
-        (3.81, True),
-        (3.80, False),
+        # At 4 m a twentieth of the sensor's depth is more than the tenth of a metre that counts near by.
+        (4.0, (0.0, 4.21, 3.81), (4.22, 3.80)),
+        (1.0, (1.09, 0.91), (1.11, 0.89)),
+        # Triangles nearer than a centimeter are not drawn.
+        (0.02, (0.0,), ()),
+        (0.009, (), (0.0,)),
     ],
 )
-def test_the_sensor_may_differ_by_a_twentieth_of_its_depth_far_away(sensor: float, seen: bool) -> None:
-    assert (instance_of_wall(4.0, sensor) == 1) is seen
+def test_the_sensor_may_differ_by_a_twentieth_of_its_depth_and_by_a_tenth_of_a_metre(depth, drawn, hidden):
+    assert [instance_of_wall(depth, sensor) for sensor in drawn] == [1] * len(drawn)
+    assert 1 not in [instance_of_wall(depth, sensor) for sensor in hidden]
 
 
-@pytest.mark.parametrize(("sensor", "seen"), [(1.09, True), (1.11, False), (0.91, True), (0.89, False)])
-def test_the_sensor_may_differ_by_a_tenth_of_a_metre_near_by(sensor: float, seen: bool) -> None:
-    assert (instance_of_wall(1.0, sensor) == 1) is seen
-
-
-@pytest.mark.parametrize(("depth", "drawn"), [(0.02, True), (0.009, False)])
-def test_triangles_nearer_than_a_centimeter_are_not_drawn(depth: float, drawn: bool) -> None:
-    assert (instance_of_wall(depth, 0.0) == 1) is drawn
+def square(corners: np.ndarray) -> MeshLabels:
+    instances, faces = np.ones(4, np.int32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return MeshLabels(vertices=corners.astype(np.float32), instances=instances, objects=((1, "wall"),), faces=faces)
 
 
 def instance_of_wall(depth: float, sensor: float) -> int:
     """At the middle pixel of a camera before a wall, away from the world's origin."""
     origin = np.array([100.0, -50.0, 7.0])
     corners = np.array([[-9, -9, depth], [9, -9, depth], [9, 9, depth], [-9, 9, depth]]) + origin
-    labels = MeshLabels(
-        vertices=corners.astype(np.float32),
-        instances=np.ones(4, np.int32),
-        objects=((1, "wall"),),
-        faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-    )
+    labels = square(corners)
     views = Views(cameras=front_camera(5, 3, 4.0), names=("a",), depths=[np.full((3, 5), sensor, np.float32)])
     instances = MeshInstances(labels, views, origin)[0]
     assert instances.shape == (3, 5)
@@ -372,12 +349,8 @@ def test_each_pixel_has_the_object_of_the_vertex_that_is_nearest_on_the_triangle
     # One edge of a slanted triangle goes from z = 1 to z = 4: its middle is at z = 2.5, which a picture shows four
     # fifths of the way to the far end.
     vertices = np.array([[-1, 0, 1], [4, 0, 4], [-1, 50, 1]], np.float32)
-    labels = MeshLabels(
-        vertices=vertices,
-        instances=np.array([1, 2, 3], np.int32),
-        objects=((1, "a"), (2, "b"), (3, "c")),
-        faces=np.array([[0, 1, 2]], np.int32),
-    )
+    instances, faces = np.array([1, 2, 3], np.int32), np.array([[0, 1, 2]], np.int32)
+    labels = MeshLabels(vertices=vertices, instances=instances, objects=((1, "a"), (2, "b"), (3, "c")), faces=faces)
     K = np.array([[50, 0, 50], [0, 50, 0], [0, 0, 1]], np.float64)
     instances, depth = draw_instances(labels, np.eye(4), K, 101, 3)
     # The middle (1.5, 0, 2.5) projects to 50 + 50 · 0.6 = 80.
@@ -397,10 +370,4 @@ def test_triangles_with_a_common_edge_leave_no_pixel_between_them() -> None:
         for turn in (0, 1):
             size = 9 if turn == 0 else float(rng.uniform(5, 20))
             corners = np.array([[-size, -size, depth], [size, -size, depth], [size, size, depth], [-size, size, depth]])
-            labels = MeshLabels(
-                vertices=np.roll(corners, turn, axis=0).astype(np.float32),
-                instances=np.ones(4, np.int32),
-                objects=((1, "wall"),),
-                faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-            )
-            assert draw_instances(labels, np.eye(4), K, 20, 20)[0].all()
+            assert draw_instances(square(np.roll(corners, turn, axis=0)), np.eye(4), K, 20, 20)[0].all()

@@ -152,9 +152,8 @@ def test_bounds_are_those_of_all_corners_in_any_order_or_of_a_lower_and_an_upper
         assert "bbox must be a list of 8 corners [x, y, z]" in refused(corner_bounds, wrong, HERE, "bbox")
     assert "bbox[1] must be a corner" in refused(corner_bounds, [[0, 0, 0], [1, 1]], HERE, "bbox")
     assert corner_bounds([[0, 0, 0], [1e9, 1, 1]], HERE, "bbox")[1][0] == 1e9
-    assert "bbox[1] must be a finite number of at most 1e+09" in refused(
-        corner_bounds, [[0, 0, 0], [1.1e9, 1, 1]], HERE, "bbox"
-    )
+    problem = refused(corner_bounds, [[0, 0, 0], [1.1e9, 1, 1]], HERE, "bbox")
+    assert "bbox[1] must be a finite number of at most 1e+09" in problem
 
 
 def test_names_and_ids_are_texts_of_one_line_and_ids_are_numbers_as_well() -> None:
@@ -175,9 +174,8 @@ def test_entries_have_their_number_and_their_key_in_messages() -> None:
     path = Path("f.json")
     assert [where for _, where in entries_of(rows, path, "a")] == ["f.json: entry 0", "f.json: entry 1"]
     assert entries_of(rows[:1], path, "a", key="rows") == (({"a": 1}, "f.json: rows[0]"),)
-    assert "f.json: rows must be a list of objects with a, got an object" in refused(
-        entries_of, {}, path, "a", key="rows"
-    )
+    problem = refused(entries_of, {}, path, "a", key="rows")
+    assert "f.json: rows must be a list of objects with a, got an object" in problem
     assert "f.json: expected a list of objects with a, got 3" in refused(entries_of, 3, path, "a")
     assert "f.json: entry 1: expected an object with a, got 3" in refused(entries_of, [{}, 3], path, "a")
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from seed_views import camera, colors_of, frames, normals_of, plane_depth, same, sphere_depth
@@ -78,21 +79,17 @@ class TestPoints:
 
 
 class TestMesh:
-    @pytest.fixture(autouse=True)
-    def _trimesh(self):
-        self.trimesh = pytest.importorskip("trimesh")
-
     def test_a_coarse_box_is_covered_without_holes(self, tmp_path):
-        mesh = self.trimesh.creation.box((1.0, 0.6, 0.4))
+        mesh = trimesh.creation.box((1.0, 0.6, 0.4))
         mesh.export(tmp_path / "box.ply")
         g = seed_from_mesh(tmp_path / "box.ply", voxel=0.05)
-        points, _ = self.trimesh.sample.sample_surface(mesh, 3000, seed=0)
+        points, _ = trimesh.sample.sample_surface(mesh, 3000, seed=0)
         assert cKDTree(g.means).query(points)[0].max() < 0.05
         assert np.abs(g.means).max(axis=0) == pytest.approx([0.5, 0.3, 0.2], abs=1e-5)
         assert np.abs(normals_of(g)).max(axis=1).min() > 0.999
 
     def test_a_fine_sphere_keeps_its_shape_and_vertex_colors(self, tmp_path):
-        mesh = self.trimesh.creation.icosphere(subdivisions=5, radius=0.5)
+        mesh = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
         mesh.visual.vertex_colors = np.where(mesh.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
         mesh.export(tmp_path / "ball.ply")
         g = seed_from_mesh(tmp_path / "ball.ply", voxel=0.05, origin=np.array([10.0, 0, 0]))
@@ -104,7 +101,7 @@ class TestMesh:
         assert np.array_equal(red[away], centered[away, 2] > 0)
 
     def test_slivers_take_few_samples_and_leave_no_hole(self, tmp_path):
-        sliver = self.trimesh.Trimesh([[0, 0, 0], [10, 0, 0], [10, 0.001, 0]], [[0, 1, 2]], process=False)
+        sliver = trimesh.Trimesh([[0, 0, 0], [10, 0, 0], [10, 0.001, 0]], [[0, 1, 2]], process=False)
         sliver.export(tmp_path / "sliver.ply")
         g = seed_from_mesh(tmp_path / "sliver.ply", voxel=0.02)
         assert 450 < len(g) < 1100
@@ -115,11 +112,11 @@ class TestMesh:
 
         picture = np.zeros((8, 8, 3), np.uint8)
         picture[:, :4], picture[:, 4:] = [250, 0, 0], [0, 250, 0]
-        quad = self.trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
-        material = self.trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))
-        quad.visual = self.trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]], material=material)
-        scene = self.trimesh.Scene()
-        scene.add_geometry(quad, transform=self.trimesh.transformations.translation_matrix([5, 0, 0]))
+        quad = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))
+        quad.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]], material=material)
+        scene = trimesh.Scene()
+        scene.add_geometry(quad, transform=trimesh.transformations.translation_matrix([5, 0, 0]))
         scene.export(tmp_path / "quad.glb")
         g = seed_from_mesh(tmp_path / "quad.glb", voxel=0.1)
         assert g.means[:, 0].min() > 4.9
@@ -129,10 +126,8 @@ class TestMesh:
         assert (colors_of(g)[right, 1] > 0.9).all()
 
     def test_a_point_cloud_file_is_seeded_as_points(self, tmp_path, rng):
-        cloud = self.trimesh.PointCloud(
-            rng.uniform(0, 1, (500, 3)) * [1, 1, 0], colors=np.full((500, 4), 200, np.uint8)
-        )
-        cloud.export(tmp_path / "cloud.ply")
+        points, colors = rng.uniform(0, 1, (500, 3)) * [1, 1, 0], np.full((500, 4), 200, np.uint8)
+        trimesh.PointCloud(points, colors=colors).export(tmp_path / "cloud.ply")
         g = seed_from_mesh(tmp_path / "cloud.ply", voxel=0.001)
         assert 480 < len(g) <= 500
         assert np.abs(colors_of(g) * 255 - 200).max() < 1
@@ -146,7 +141,7 @@ class TestMesh:
                 seed_from_mesh(tmp_path / name, voxel=0.1)
 
     def test_a_mesh_in_other_units_than_the_voxel_is_an_error_that_says_so(self, tmp_path):
-        self.trimesh.creation.box((5000, 5000, 3000)).export(tmp_path / "mm.ply")
+        trimesh.creation.box((5000, 5000, 3000)).export(tmp_path / "mm.ply")
         with pytest.raises(InputError, match="give a larger voxel, or the scene's metres_per_unit"):
             seed_from_mesh(tmp_path / "mm.ply", voxel=0.02)
 
@@ -205,7 +200,6 @@ class TestSeed:
             assert 100 < len(seed(cloud)) <= 300
 
     def test_a_mesh_without_a_unit_takes_its_voxel_from_the_cameras(self, tmp_path):
-        trimesh = pytest.importorskip("trimesh")
         trimesh.creation.box((100.0, 100.0, 100.0)).export(tmp_path / "box.ply")
         config = SeedConfig(source="mesh", mesh=str(tmp_path / "box.ply"))
         views = Views(cameras=camera((0.0, 0.0, -400.0)), names=("a",))
@@ -215,13 +209,8 @@ class TestSeed:
 
     def test_sources_that_the_scene_does_not_have_are_errors(self):
         scene = Scene(name="bare")
-        for source, message in (
-            ("auto", "neither photographs"),
-            ("photographs", "no views"),
-            ("points", "no structure"),
-            ("depth", "no views"),
-            ("tsdf", "no views"),
-        ):
+        problems = dict.fromkeys(("photographs", "depth", "tsdf"), "no views")
+        for source, message in (problems | {"auto": "neither photographs", "points": "no structure"}).items():
             with pytest.raises(InputError, match=message):
                 seed(scene, SeedConfig(source=source))
         room = make_room(0, views=1, width=8, height=6)
@@ -264,9 +253,7 @@ def test_seeds_of_a_turned_room_are_its_turned_seeds():
     same = distance < 1e-3
     assert same.mean() > 0.99
     assert np.isclose(there.scales[nearest], here.scales, rtol=0.05).all(axis=1)[same].mean() > 0.98
-    normals = [
-        Rotation.from_quat(each.quats, scalar_first=True).as_matrix()[:, :, 2] for each in (here, there)
-    ]  # fmt: skip
+    normals = [normals_of(each) for each in (here, there)]
     cosines = np.einsum("ni,ni->n", normals[0] @ other_from_world[:3, :3].T, normals[1][nearest])
     assert np.mean(np.abs(cosines[same]) > 0.999) > 0.99
 

@@ -32,16 +32,12 @@ def arc(count: int, step: float = 10.0, radius: float = 2.0) -> Cameras:
     return looking_cameras(centers, -centers / radius, UP, width=64, height=48, focal=60.0)
 
 
-def moved(cameras: Cameras, rotation: np.ndarray, scale: float) -> Cameras:
-    poses = cameras.cam_from_world.astype(np.float64)
-    poses[:, :3, :3] = poses[:, :3, :3] @ rotation.T
-    poses[:, :3, 3] *= scale
-    return replace(cameras, cam_from_world=poses.astype(np.float32))
-
-
 def test_distances_and_overlaps_do_not_depend_on_the_world():
     cameras = arc(6)
-    other = moved(cameras, Rotation.random(random_state=0).as_matrix(), 7.0)
+    poses = cameras.cam_from_world.copy()
+    poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.random(random_state=0).as_matrix().T
+    poses[:, :3, 3] *= 7
+    other = replace(cameras, cam_from_world=poses)
     assert typical_distance(other) == pytest.approx(7 * typical_distance(cameras), rel=1e-4)
     np.testing.assert_allclose(overlaps(other, 14.0), overlaps(cameras, 2.0), atol=0.02)
     assert choose_pairs(other, 2) == choose_pairs(cameras, 2)

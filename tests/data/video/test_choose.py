@@ -48,10 +48,8 @@ def test_sharpness_falls_with_blur_and_is_zero_for_one_color():
 def test_frames_are_evenly_apart_although_the_camera_paused_and_the_sharp_ones_are_taken():
     lefts = [*np.arange(0, 200, 4.0), *[200.0] * 20, *np.arange(200, 500, 4.0)]
     sharp = np.arange(len(lefts)) % 4 == 1
-    pictures = [
-        looking_at(left) if is_sharp else blurred(looking_at(left), 3)
-        for left, is_sharp in zip(lefts, sharp, strict=True)
-    ]
+    both = zip(map(looking_at, lefts), sharp, strict=True)
+    pictures = [picture if is_sharp else blurred(picture, 3) for picture, is_sharp in both]
     chosen = choose_frames(follow(pictures), motion=0.08, most=200, least=3)
     assert sharp[chosen].all()
     steps = np.diff(np.array(lefts)[chosen]) / WIDTH

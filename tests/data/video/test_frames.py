@@ -36,9 +36,8 @@ def write_video(path: Path, pictures: list[np.ndarray], *, rotation: int = 0, co
 @cache
 def pan(count: int = 61, step: float = 6.0) -> list[np.ndarray]:
     """A camera that moves to the side; every third frame is sharp."""
-    return [
-        looking_at(step * index) if index % 3 == 0 else blurred(looking_at(step * index), 3) for index in range(count)
-    ]
+    pictures = [looking_at(step * index) for index in range(count)]
+    return [picture if index % 3 == 0 else blurred(picture, 3) for index, picture in enumerate(pictures)]
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +79,8 @@ def test_a_video_that_was_taken_upright_gives_upright_frames(tmp_path, rotation)
     first = next(Video(path).frames())
     # PyAV and the display matrix of the file agree on counterclockwise; numpy turns the same way.
     assert round(first.rotation) % 360 == rotation % 360
-    np.testing.assert_allclose(
-        color_picture(first, 96).astype(int), np.rot90(picture, rotation // 90).astype(int), atol=30
-    )
+    turned = np.rot90(picture, rotation // 90)
+    np.testing.assert_allclose(color_picture(first, 96).astype(int), turned.astype(int), atol=30)
 
 
 def test_pixels_that_are_not_square_become_square(tmp_path):
