@@ -108,13 +108,12 @@ def test_a_question_that_is_refused_keeps_no_other_from_its_answer(features, tmp
 
 
 def test_an_answer_that_was_begun_with_other_settings_leaves_nothing_behind(features: Path, tmp_path: Path) -> None:
-    out, file = (
-        tmp_path / "o",
-        batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "the crate"}),
-    )
+    out = tmp_path / "o"
+    file = batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "the crate"})
     with serving(crate_refused) as server:
         words = (f"questions={file}", f"vlm.base_url={server.url}")
-        assert ask(features, out, *words, "choose.count=4") == 2
+        assert ask(features, out, *words, "choose.width=320") == 2
+    assert len(server.requests) == 2
     assert ask(features, out, *words, "dry_run=true") == 0
     for folder in ("00001", "00002"):
         names = {path.name for path in (out / folder).iterdir()}
