@@ -68,7 +68,7 @@ def test_words_are_found_in_an_interpreter_that_has_no_torch_and_by_the_example(
         f"splat, weights, out = {str(tmp_path / 'room.ply')!r}, {str(exported / 'encoder.onnx')!r}, {str(tmp_path)!r}\n"
         "assert main(['encode', splat, f'weights={weights}', f'out={out}/features']) == 0\n"
         "from gsencoder import load_splat, localize\n"
-        "from gsencoder.fusion.exported import load_features\n"
+        "from gsencoder.fusion.folder import load_features\n"
         "from gsencoder.infer.encode import Encoder\n"
         "scene = load_features(__import__('pathlib').Path(out) / 'features')\n"
         "assert len(localize(scene, ['mugs'], Encoder.load(weights).words).boxes) > 0\n"
