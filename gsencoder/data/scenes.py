@@ -465,8 +465,8 @@ class SceneConfig:
 def load_scene(path: str | Path, *, splat: str | Path | None = None, options: SceneConfig = SceneConfig()) -> Scene:
     """Reads a scene; of pictures the size is read now, and they are decoded on access.
 
-    Recognized, in this order: the layouts of `gsencoder.data.scenes` (transforms.json, COLMAP, ScanNet++,
-    ScanNet, 7-Scenes, TUM RGB-D, Replica), a splat file, or a folder with one splat file or an unpacked .sog.
+    Recognized, in this order: `LAYOUTS` (transforms.json, COLMAP, ScanNet++, ScanNet, 7-Scenes, TUM RGB-D, Replica), a
+    splat file, or a folder with one splat file or an unpacked .sog.
 
     Cameras and Gaussians are relative to `Scene.origin`: the mean of the camera centers (for a bare splat the median
     of its means), each coordinate rounded to a multiple of 1000 units. It is subtracted in float64.

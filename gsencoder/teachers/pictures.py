@@ -222,11 +222,11 @@ def read_preprocessing(folder: Path, subject: str, *, floats: bool = False) -> P
     Its sizes and crops are not used: a map is of the whole picture. Mean, standard deviation and filter must be given,
     since features of pictures that were normalized otherwise look plausible, and are wrong.
     """
-    path, found = _find_settings(folder, subject)
+    path, settings = _find_settings(folder, subject)
     try:
-        resample = Image.Resampling(found["resample"])
-        mean, std = ([float(value) for value in found[name]] for name in ("image_mean", "image_std"))
-        factor = float(found.get("rescale_factor", 1 / 255)) if found.get("do_rescale", True) else 1.0
+        resample = Image.Resampling(settings["resample"])
+        mean, std = ([float(value) for value in settings[name]] for name in ("image_mean", "image_std"))
+        factor = float(settings.get("rescale_factor", 1 / 255)) if settings.get("do_rescale", True) else 1.0
         if len(mean) != 3 or len(std) != 3 or not np.isfinite([*mean, *std, factor]).all() or min(*std, factor) <= 0:
             raise ValueError("numbers out of range")
     except (KeyError, TypeError, ValueError) as error:
@@ -236,7 +236,7 @@ def read_preprocessing(folder: Path, subject: str, *, floats: bool = False) -> P
         ) from error
     if floats and resample not in FLOAT_FILTERS:
         raise InputError(f"{subject}: {path}: resample: expected 2 (bilinear) or 3 (bicubic), got {int(resample)}")
-    if not found.get("do_normalize", True):
+    if not settings.get("do_normalize", True):
         mean, std = [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
     return Preprocessing(resample=resample, factor=factor, mean=tuple(mean), std=tuple(std), floats=floats)
 
@@ -245,12 +245,12 @@ def _find_settings(folder: Path, subject: str) -> tuple[Path, dict[str, Any]]:
     """The file that states the preprocessing, and what it states."""
     for path in (folder / name for name in FILES):
         try:
-            found = json.loads(read_foreign_text(path))
+            content = json.loads(read_foreign_text(path))
         except FileNotFoundError:
             continue
         except (OSError, ValueError) as error:
             raise InputError(f"{subject}: {path}: cannot be read: {error}") from error
-        section = found.get("image_processor") if isinstance(found, dict) and path.name == FILES[0] else found
+        section = content.get("image_processor") if isinstance(content, dict) and path.name == FILES[0] else content
         if isinstance(section, dict):
             return path, section
     raise InputError(

@@ -321,7 +321,7 @@ def shell_cameras(
     Directions lie on a spiral. Along each the distance is the one at which the target's outline fills a share of the
     picture, its frame permitting, or nearer where a surface would stand between. Directions are left out from which the
     camera would be too near to a surface, where no known camera has looked, or so near that little else is seen. Of
-    the others the ones are kept with most of the scene behind and around the target, evenly spread; none where
+    the others, the directions with most of the scene behind and around the target are kept, evenly spread; none where
     there is no room."""
     focal = width / (2 * math.tan(math.radians(CONSTANTS.fov_degrees) / 2))
     outward, vertical = spiral_directions(max(CONSTANTS.tried_directions * count, CONSTANTS.min_tried_directions), up)
