@@ -21,7 +21,7 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.basis import field_error, judge
-from gsencoder.infer.encode import EncodeConfig, load_encoder
+from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.encode_budget import EncodeBudget, encode_within
 
 
@@ -35,7 +35,7 @@ def main() -> None:
     add_json_option(parser)
     given = parser.parse_args()
     retain_freed_memory()
-    encoder = load_encoder(given.weights)
+    encoder = Encoder.load(given.weights)
     config, lines = EncodeConfig(chunk=given.chunk), []
     for path in given.scenes:
         scene = with_gaussians(load_scene(path), SeedConfig())

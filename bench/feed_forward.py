@@ -24,7 +24,7 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.evaluate.benchmarks.naming import compare_names, naming_scores
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.encode import load_encoder
+from gsencoder.infer.encode import Encoder
 from gsencoder.memory.bank import MapStream, build_bank, principal_queries
 from gsencoder.memory.index import index_features
 from gsencoder.teachers.base import Teacher
@@ -55,7 +55,7 @@ def main() -> None:
     parser.add_argument("--optimize", action="store_true", help="also optimize a memory of each room")
     add_json_option(parser)
     arguments = parser.parse_args()
-    encoder, labels = load_encoder(arguments.weights), LabelsConfig()
+    encoder, labels = Encoder.load(arguments.weights), LabelsConfig()
     words = words_of(labels)
     teacher_name = next(name for name, space in encoder.spaces.items() if space.teacher == "labels")
     others = [load_scene(path) for path in arguments.bank_rooms]

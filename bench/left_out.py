@@ -30,7 +30,7 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.infer.encode import load_encoder
+from gsencoder.infer.encode import Encoder
 from gsencoder.render import blend
 from gsencoder.teachers.build import words_of
 from gsencoder.types import FeatureMap, GaussianFeatures, Gaussians, Scene
@@ -117,7 +117,7 @@ def score(arguments: argparse.Namespace) -> None:
     print("|---|---|---|---|---|")
     rows = {"fused": fused}
     for weights in arguments.weights:
-        encoder = load_encoder(weights)
+        encoder = Encoder.load(weights)
         unit = unit_of(kept, encoder.voxel)
         rows[Path(weights).name] = encoder.encode(kept.gaussians, metres_per_unit=unit)
     figures = {}

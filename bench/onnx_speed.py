@@ -26,11 +26,11 @@ def measure(model: str, splat: str) -> dict[str, float]:
     """One process's figures; runs in the child."""
     from gsencoder.core.process import peak_memory_mb, retain_freed_memory
     from gsencoder.data.splats.files import load_splat
-    from gsencoder.infer.encode import EncodeConfig, load_encoder
+    from gsencoder.infer.encode import EncodeConfig, Encoder
 
     gaussians = load_splat(splat)
     retain_freed_memory()
-    encoder = load_encoder(model, "cpu")
+    encoder = Encoder.load(model, "cpu")
     # A file computes in what it was exported in.
     config = EncodeConfig(chunk=0, precision="auto" if model.endswith(".onnx") else "float32", device="cpu")
     encoder.encode(gaussians, config)

@@ -23,7 +23,7 @@ from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.benchmarks.absent import AbsentProtocol, names_of, words_to_ask
 from gsencoder.evaluate.sources import encoder_source, fusion_source, with_features
-from gsencoder.infer.encode import load_encoder
+from gsencoder.infer.encode import Encoder
 from gsencoder.infer.localize import find_candidates
 from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig
@@ -145,7 +145,7 @@ def main() -> None:
         )
     text = OnnxTextConfig(model=arguments.text, pooling="mean") if arguments.text else TableTextConfig()
     if arguments.weights:
-        encoder = load_encoder(arguments.weights)
+        encoder = Encoder.load(arguments.weights)
         space = arguments.space or next(iter(encoder.tables), None)
         if space not in encoder.tables:
             option = f"--space {arguments.space}" if arguments.space else f"--weights {arguments.weights}"

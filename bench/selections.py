@@ -45,7 +45,7 @@ from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.benchmarks.localization import is_seen, queryable_objects, score_boxes
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
-from gsencoder.infer.encode import load_encoder
+from gsencoder.infer.encode import Encoder
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.select import select
 from gsencoder.render import Blend, blend
@@ -213,7 +213,7 @@ def main() -> None:
     if arguments.boxes:
         write_figures(arguments.json, count_boxes(arguments.rooms, arguments.splats))
         return
-    words, encoder = words_of(LabelsConfig()), load_encoder(arguments.weights)
+    words, encoder = words_of(LabelsConfig()), Encoder.load(arguments.weights)
     totals: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for path in arguments.rooms:
         start = time.perf_counter()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gsencoder import load_encoder, load_scene, localize, render_image, save_features, save_splat, seed
+from gsencoder import Encoder, load_scene, localize, render_image, save_features, save_splat, seed
 from gsencoder.render import blend
 
 
@@ -20,7 +20,7 @@ def main(folder: str, words: str) -> None:
     scene = replace(scene, gaussians=scene.gaussians or seed(scene))
 
     # The network sees means, rotations, scales, opacities and colors of the Gaussians, in metres.
-    encoder = load_encoder("house_cpu")
+    encoder = Encoder.load("house_cpu")
     features = encoder.encode(scene.gaussians, metres_per_unit=scene.metres_per_unit or 1.0)
     print(f"{len(features):,} features of {features.space.describe()}")
 

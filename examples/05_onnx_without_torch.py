@@ -6,11 +6,11 @@ python examples/05_onnx_without_torch.py encoder.onnx room.ply table   # room.pl
 
 import sys
 
-from gsencoder import InputError, Scene, load_encoder, load_splat, localize
+from gsencoder import Encoder, InputError, Scene, load_splat, localize
 
 
 def main(model: str, splat: str, word: str) -> None:
-    encoder = load_encoder(model)
+    encoder = Encoder.load(model)
     if encoder.words is None:
         raise InputError(f"{model} holds no words")
     gaussians = load_splat(splat)

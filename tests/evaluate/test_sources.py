@@ -53,7 +53,7 @@ def test_the_space_is_that_which_is_named_or_that_of_the_words(name, monkeypatch
     twin.spaces["c"] = replace(twin.spaces["c"], text_encoder="a-words")
     with pytest.raises(InputError, match="those of 2 of the encoder's teachers"):
         space_of_words(twin, WORDS["a"])
-    monkeypatch.setattr(evaluate_sources, "load_encoder", lambda *_: encoder)
+    monkeypatch.setattr(evaluate_sources.Encoder, "load", lambda *_: encoder)
     source, words = evaluate_sources.teacher_or_encoder(
         evaluate_sources.EvaluateConfig(paths=("s",), weights="w", space=name)
     )

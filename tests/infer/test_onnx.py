@@ -14,7 +14,7 @@ import pytest
 from rooms import merged
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.encode import TOLERANCE, Cloud, EncodeConfig, Encoder, check_parity, load_encoder
+from gsencoder.infer.encode import TOLERANCE, Cloud, EncodeConfig, Encoder, check_parity
 from gsencoder.infer.onnx.export import random_cloud, search
 from gsencoder.infer.onnx.runtime import (
     KEY,
@@ -169,21 +169,21 @@ def test_files_that_are_no_encoder_are_refused(exported: Path, tmp_path: Path) -
     for size in (0, 100, len(whole) // 2, len(whole) - 1):
         (tmp_path / "cut.onnx").write_bytes(whole[:size])
         with pytest.raises(InputError, match="cut.onnx: is no model that onnxruntime reads, or damaged"):
-            load_encoder(str(tmp_path / "cut.onnx"))
+            Encoder.load(str(tmp_path / "cut.onnx"))
     with pytest.raises(InputError, match="no file at"):
-        load_encoder(str(tmp_path / "none.onnx"))
+        Encoder.load(str(tmp_path / "none.onnx"))
     value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
     graph = onnx.helper.make_graph([onnx.helper.make_node("Identity", ["x"], ["y"])], "g", [value], [value])
     graph.output[0].name = "y"
     other = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 20)], ir_version=9)
     onnx.save(other, tmp_path / "other.onnx")
     with pytest.raises(InputError, match="other.onnx: is no encoder that `gsencoder export` wrote"):
-        load_encoder(str(tmp_path / "other.onnx"))
+        Encoder.load(str(tmp_path / "other.onnx"))
     for entry in (each for each in onnx.load(exported / "encoder.onnx").metadata_props if each.key != SUM):
         other.metadata_props.add(key=entry.key, value=entry.value)
     onnx.save(other, tmp_path / "other.onnx")
     with pytest.raises(InputError, match=r"expected inputs corner: tensor\(float\).*, got x: tensor\(float\)"):
-        load_encoder(str(tmp_path / "other.onnx"))
+        Encoder.load(str(tmp_path / "other.onnx"))
 
 
 def test_a_changed_file_is_refused_unless_it_says_so(exported: Path, tmp_path: Path) -> None:
@@ -194,18 +194,18 @@ def test_a_changed_file_is_refused_unless_it_says_so(exported: Path, tmp_path: P
         damaged[offset] ^= 64
         file.write_bytes(damaged)
         with pytest.raises(InputError, match="changed.onnx"):
-            load_encoder(str(file))
+            Encoder.load(str(file))
     model = onnx.load(exported / "encoder.onnx")
     (entry,) = (each for each in model.metadata_props if each.key == KEY)
     entry.value = entry.value.replace('"patch": 24', '"patch": 25')
     onnx.save(model, file)
     with pytest.raises(InputError, match="do not have the sum"):
-        load_encoder(str(file))
+        Encoder.load(str(file))
     (entry,) = (each for each in model.metadata_props if each.key == SUM)
     model.metadata_props.remove(entry)
     onnx.save(model, file)
     with pytest.warns(SceneWarning, match="another program changed it"):
-        load_encoder(str(file))
+        Encoder.load(str(file))
 
 
 def test_what_cannot_be_encoded_is_refused_on_both_sides_alike(both: tuple[Encoder, Encoder]) -> None:

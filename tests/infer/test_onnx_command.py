@@ -14,7 +14,7 @@ from torch import nn
 from gsencoder.app import main as cli
 from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, save_heads
-from gsencoder.infer.encode import TOLERANCE, load_encoder
+from gsencoder.infer.encode import TOLERANCE, Encoder
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.teachers.base import Head
@@ -88,7 +88,7 @@ def test_an_exported_encoder_carries_its_heads(weights, lowered, tmp_path, monke
     shutil.copytree(weights, tmp_path / "encoder")
     head = Head(name="siglip.summary", body=nn.Sequential(nn.Linear(6, 4)))
     heads = HeadSet(
-        space=load_encoder(str(weights)).spaces["labels"],
+        space=Encoder.load(str(weights)).spaces["labels"],
         heads=(MeasuredHead(head=head, mean=np.zeros(4, np.float32), scale=1.0, cells=1, cosine=1.0, worst=1.0),),
     )
     beside = tmp_path / "encoder" / "heads.safetensors"

@@ -24,7 +24,7 @@ from gsencoder.data.splats.files import READABLE
 from gsencoder.data.up import with_up
 from gsencoder.fusion.basis import basis_figures, describe_basis, project_maps
 from gsencoder.fusion.folder import FEATURES_FILE, save_features
-from gsencoder.infer.encode import EncodeConfig, Encoder, file_of_encoder, load_encoder
+from gsencoder.infer.encode import EncodeConfig, Encoder, file_of_encoder
 from gsencoder.infer.encode_budget import (
     BudgetEncoding,
     EncodeBudget,
@@ -72,7 +72,7 @@ def run(config: EncodeCommandConfig, run: Run) -> None:
     retain_freed_memory()
     paths = find_scenes(config.paths)
     with run.step("weights"):
-        encoder, file = load_encoder(config.weights, config.encode.device), file_of_encoder(config.weights)
+        encoder, file = Encoder.load(config.weights, config.encode.device), file_of_encoder(config.weights)
         heads = find_heads(file)
         _warn_of_missing(encoder, file, heads, config.spaces)
     made_with = {"weights": str(file), "weights_digest": digest_files(file)}

@@ -46,7 +46,7 @@ from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.measured_heads import find_head, load_heads
-from gsencoder.infer.encode import EncodeConfig, file_of_encoder, load_encoder
+from gsencoder.infer.encode import EncodeConfig, Encoder, file_of_encoder
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.models.output_space import find_heads
 from gsencoder.teachers.build import TeacherConfig, words_of
@@ -175,7 +175,7 @@ def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
         words = _words_of_teacher(config)
         return fusion_source(config.teacher, words, config.fusion), words
     retain_freed_memory()
-    encoder = load_encoder(config.weights, config.encode.device)
+    encoder = Encoder.load(config.weights, config.encode.device)
     table = find_table(encoder, config.space)
     if table is not None and config.teacher == LabelsConfig() and config.text == TableTextConfig():
         words = words_of_table(table)
@@ -212,7 +212,7 @@ def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     head = find_head(heads, config.head)
     words = words_of_head(head.head, table, config.text)
     retain_freed_memory()
-    encoder = load_encoder(config.weights, config.encode.device)
+    encoder = Encoder.load(config.weights, config.encode.device)
     source = encoder_source(encoder, config.encode, config.space or heads.space.name)
     return head_source(source, heads, head, words.space.text_encoder), words
 

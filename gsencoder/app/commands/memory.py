@@ -21,7 +21,7 @@ from gsencoder.data.scenes import find_scenes
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.evaluate.sources import RenderedErrors, RenderedTally
 from gsencoder.fusion.folder import MEMORY_FILE, save_memories
-from gsencoder.infer.encode import EncodeConfig, load_encoder
+from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.memory.bank import BankConfig
 from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.teachers.build import stored_words, words_by_teacher
@@ -203,7 +203,7 @@ def _prepare(
 def predicted_features(scene: Scene, config: MemoryCommandConfig) -> dict[str, GaussianFeatures]:
     """The features that an encoder predicts for a scene, by its teachers."""
     assert scene.gaussians is not None
-    encoder = load_encoder(config.weights, config.device)
+    encoder = Encoder.load(config.weights, config.device)
     encoding = EncodeConfig(device=config.device)
     return encoder.encode_spaces(scene.gaussians, encoding, metres_per_unit=unit_of(scene, encoder.voxel))
 

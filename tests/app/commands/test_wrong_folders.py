@@ -14,7 +14,7 @@ from gsencoder.data.scenes import find_scenes
 from gsencoder.data.splats.files import read_raw
 from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, SCENE_FILE, load_features, load_memories
 from gsencoder.fusion.package import PACKAGE_FILE
-from gsencoder.infer.encode import load_encoder
+from gsencoder.infer.encode import Encoder
 from gsencoder.models.output_space import WEIGHTS_FILE, load_output_spaces
 
 WRITTEN = {
@@ -34,7 +34,7 @@ READERS = {
         lambda path: scene_folders([path], ["room"]), (*FEATURE_FOLDERS, "several"), FEATURES,
     ),
     "export memory=": (load_memories, ("memory",), "expected a folder with a memory, which `gsencoder memory` writes"),
-    "weights=": (load_encoder, ("train",), "`gsencoder train` w"),
+    "weights=": (Encoder.load, ("train",), "`gsencoder train` w"),
     "fuse basis=": (load_output_spaces, ("train",), "`gsencoder train` w"),
     "fuse, encode, train, reconstruct, evaluate": (
         lambda path: find_scenes([path]),
