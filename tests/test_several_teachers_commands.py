@@ -97,7 +97,7 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_named(rooms, t
     (encoded / "words.labels.safetensors").rename(tmp_path / "lost")
     lost = refusal(capsys, "localize", str(encoded), "space=labels", "query=cat", f"out={tmp_path / 'none'}")
     (tmp_path / "lost").rename(encoded / "words.labels.safetensors")
-    assert "holds words of room-words, which lead into these features" in lost
+    assert "holds words of room-words, the text encoder of these features" in lost
 
 
 def test_words_are_asked_of_the_space_that_is_named(encoded, tmp_path, capsys):

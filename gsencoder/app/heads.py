@@ -92,8 +92,8 @@ def words_of_head(head: Head, words_file: str, text: TextConfig) -> Words:
         words = words_of_table(load_text_table(words_file), text)
     elif isinstance(text, TableTextConfig):
         raise InputError(
-            f"head={head.name}: no words lead into its space; give text=transformers text.model=FOLDER, the text side "
-            f"of {head.model or f'its {head.text} model'}, or words=FILE"
+            f"head={head.name}: no text table of its space was given; give text=transformers text.model=FOLDER, the "
+            f"text side of {head.model or f'its {head.text} model'}, or words=FILE"
         )
     else:
         words = vocabulary_of(text)

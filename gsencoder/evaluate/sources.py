@@ -83,7 +83,7 @@ def find_table(encoder: Encoder, space: str | None) -> TextTable | None:
 
 
 def head_source(source: FeatureSource, heads: HeadSet, head: MeasuredHead, text_encoder: str) -> FeatureSource:
-    """A source that applies one of some adapter heads to backbone features; `text_encoder` leads into its space."""
+    """A source that applies one of some adapter heads to backbone features; `text_encoder` is that of its space."""
 
     def outputs(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         features, seconds = source(scene)

@@ -216,8 +216,8 @@ def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, Gaussia
     """A scene's Gaussians and one of its feature sets.
 
     Args:
-        space: name of the feature set, of its space, or of its teacher; None = the only one, or the only one that words
-            lead into.
+        space: name of the feature set, of its space, or of its teacher; None = the only one, or the only one with a
+            text encoder.
     """
     if scene.gaussians is None or not scene.features:
         missing = "Gaussians" if scene.gaussians is None else "features"

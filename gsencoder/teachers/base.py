@@ -96,14 +96,14 @@ class Head:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TeacherSettings(CheckedConfig):
-    """The settings of a teacher, which answer for it: how it is built, and which words lead into its space.
+    """The settings of a teacher, which answer for it: how it is built, and which words are in its space.
 
     A subclass has a field `name: Literal["…"]`, the value of `teacher=`, and a line in `gsencoder.teachers.build`.
 
     Attributes:
         per_scene: whether the teacher is made of a scene's own labels or masks; any other is built once for all scenes.
         needs_labels: whether it needs labels of objects, which a bare splat does not have.
-        has_heads: whether adapter heads lead from its space into others.
+        has_heads: whether adapter heads map its space to others.
     """
 
     per_scene: ClassVar[bool] = False
@@ -119,7 +119,7 @@ class TeacherSettings(CheckedConfig):
         raise NotImplementedError
 
     def text_table(self) -> TextTable | None:
-        """The words of the teacher's space without a text tower; None where none lead into it."""
+        """The words of the teacher's space without a text tower; None where there are none."""
         words: str = getattr(self, "words", "")
         return load_text_table(find_file(words, "teacher.words")) if words else None
 
@@ -139,9 +139,7 @@ class TeacherSettings(CheckedConfig):
         """Why its words cannot be those of a text tower (`text=`); empty where they can be, for which settings have an
         option `words`."""
         if not hasattr(self, "words"):
-            return (
-                f"text=: no text tower leads into the features of teacher={getattr(self, 'name', '')}; leave out text="
-            )
+            return f"text=: no text tower shares the space of teacher={getattr(self, 'name', '')}; leave out text="
         if self.words:
             return "text= and teacher.words= both say what words are; leave out one of them"
         return ""

@@ -1,4 +1,4 @@
-"""The teachers by name, the words that lead into their spaces, and the choice of one for a scene (`teacher=auto`)."""
+"""The teachers by name, the words of their spaces, and the choice of one for a scene (`teacher=auto`)."""
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -26,7 +26,7 @@ TeacherConfig = (
 
 
 def text_table_of(config: TeacherConfig) -> TextTable | None:
-    """The words of the teacher's space without a text tower, or None where none lead into it."""
+    """The words of the teacher's space without a text tower; None where there are none."""
     return config.text_table()
 
 

@@ -38,7 +38,7 @@ class OnnxConfig(TeacherSettings, DenseOnnxOptions):
     space: str = option("", "short name of its feature space; empty = the file's name")
     classes: str = option("", "word vectors of a classifier's classes (.npz); features become their mixtures")
     temperature: float = option(1.0, "softmax temperature of the posteriors", ge=1e-6, le=1e6)
-    words: str = option("", "text table that leads into the space; empty if none")
+    words: str = option("", "text table of the teacher's space; empty if none")
     joint: bool = option(False, "the model is the image side of the joint model that text= is the text side of")
 
     def build(self, scene: Scene, words: Words | None) -> Teacher:  # noqa: ARG002

@@ -57,7 +57,7 @@ class RadioConfig(TeacherSettings):
     name: Literal["radio"] = "radio"
     model: str = option("", "folder of a RADIO model for transformers; also looked for in GSENCODER_MODELS")
     size: int = option(768, "longer side of the resized picture in pixels", ge=1, le=2048)
-    words: str = option("", "text table that leads into the space; empty if none")
+    words: str = option("", "text table of the teacher's space; empty if none")
     heads: tuple[str, ...] = option(
         (),
         "adapter heads that are stored with the features, such as siglip or sam: NAME.summary, "

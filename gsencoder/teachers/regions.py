@@ -97,7 +97,7 @@ class RegionsConfig(TeacherSettings, SamOptions):
         "vector=captions: what pixels without a captioned region are: mean = something else, the direction "
         "of the text side's mean; none = nothing is known of them, they have no feature",
     )
-    words: str = option("", "text table that leads into the space, or has the captions, if no text= is given")
+    words: str = option("", "text table of the teacher's space, or of the captions, if no text= is given")
     model: str = option(
         "",
         "image tower of vector=map and vector=crop: an .onnx file, or a folder of a model for transformers "

@@ -142,7 +142,7 @@ class TransformersConfig(TeacherSettings):
     overlap: float = option(
         0.5, "smallest share of a window that the next one covers again, with large=windows", ge=0, le=0.9
     )
-    words: str = option("", "text table that leads into the space; empty if none")
+    words: str = option("", "text table of the teacher's space; empty if none")
     device: Device = option("auto", "where the tower runs")
 
     def __post_init__(self) -> None:
@@ -154,8 +154,8 @@ class TransformersConfig(TeacherSettings):
         tower = TransformersTeacher(self, text_encoder=text_encoder_of(words))
         if isinstance(words, OpenVocabulary) and not tower.network.joint:
             raise InputError(
-                f"text=: no words lead into {tower.space.layer} of {tower.space.name}; leave out text=, or give a "
-                "text-aligned model (CLIP, SigLIP, SigLIP2) with its head"
+                f"text=: no text tower shares the space of {tower.space.layer} of {tower.space.name}; leave out text=, "
+                "or give a text-aligned model (CLIP, SigLIP, SigLIP2) with its head"
             )
         check_channels(tower.space, words)
         return tower
@@ -163,7 +163,7 @@ class TransformersConfig(TeacherSettings):
     def refuse_text(self) -> str:
         if self.dense == "tokens" or self.layer is not None:
             return (
-                "text=: no words lead into hidden states (teacher.dense=tokens, teacher.layer=); give "
+                "text=: no text tower shares the space of hidden states (teacher.dense=tokens, teacher.layer=); give "
                 "teacher.dense=values or summary with a text-aligned model, or leave out text="
             )
         return TeacherSettings.refuse_text(self)
@@ -297,7 +297,7 @@ class VisionTower(nn.Module):
             return "tokens"
         if not self._head:
             raise InputError(
-                f"{WHAT}: dense={dense} needs a head that leads into the space of a text tower, and this "
+                f"{WHAT}: dense={dense} needs a head that maps to the space of a text tower, and this "
                 f"{self._kind.name} tower has none; give dense=tokens"
             )
         if dense == "auto":

@@ -470,7 +470,7 @@ REFERENCE_NOUNS = tuple(Path(__file__).with_name("nouns.txt").read_text(encoding
 
 
 WORDS_FILE = "words.safetensors"
-"""The text table whose words lead into the features, where there is one."""
+"""The text table of the features' space, where there is one."""
 TEACHER_NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
 """Form of the names of teachers, which are parts of names of files."""
 
@@ -510,8 +510,8 @@ def load_tables(folder: Path, teachers: Iterable[str]) -> dict[str, TextTable]:
 
 
 def table_path(folder: Path, text_encoder: str) -> Path | None:
-    """The file in a folder of features whose words lead into the features of a space with this text encoder; None where
-    there is none, and an InputError where there are only those of other spaces."""
+    """The text table in a folder of features that this text encoder made; None where there is none, and an InputError
+    where there are only those of other encoders."""
     if (folder / WORDS_FILE).is_file():
         return folder / WORDS_FILE
     if not text_encoder:
@@ -521,8 +521,8 @@ def table_path(folder: Path, text_encoder: str) -> Path | None:
     fitting = [path for path, encoder in encoders.items() if encoder == text_encoder]
     if paths and not fitting:
         raise InputError(
-            f"{folder}: no {file_of_teacher(WORDS_FILE, 'TEACHER')} holds words of {text_encoder}, which lead into "
-            f"these features (there are words of {', '.join(sorted(set(encoders.values())))}): the file was lost; give "
-            "words= or text=, or name other features with space="
+            f"{folder}: no {file_of_teacher(WORDS_FILE, 'TEACHER')} holds words of {text_encoder}, the text encoder "
+            f"of these features (there are words of {', '.join(sorted(set(encoders.values())))}): the file was lost; "
+            "give words= or text=, or name other features with space="
         )
     return fitting[0] if fitting else None

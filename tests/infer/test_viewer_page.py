@@ -355,7 +355,7 @@ def test_features_without_words_are_shown_and_say_that_none_lead_into_them(searc
     space = replace(features.space, name="dense", text_encoder="")
     scene = replace(search.shown.scene, features={"dense": replace(features, space=space)})
     mute = SceneSearch(shown=drawn_scene(scene, "t", max_gaussians=10**6), words=None, config=LocalizeConfig())
-    with pytest.raises(InputError, match="no words lead into"):
+    with pytest.raises(InputError, match="there is no text table for these features"):
         mute.ask("mug")
     assert mute.best_words([0]) == []
     page = read_container(file_container(mute, (), OPTIONS).to_bytes())

@@ -204,7 +204,10 @@ def test_a_head_that_words_cannot_be_compared_with_is_refused(world, fused, tmp_
 def test_words_of_another_model_are_refused_and_both_are_named(world, fused, tmp_path, capsys):
     arguments = ("localize", str(fused), "head=siglip", "query=mug", f"out={tmp_path / 'x'}")
     line = refusal(capsys, *arguments)
-    assert "no words lead into its space; give text=transformers text.model=FOLDER, the text side of ViT-SO400M" in line
+    assert (
+        "no text table of its space was given; give text=transformers text.model=FOLDER, the text side of ViT-SO400M"
+        in line
+    )
     wide = small_joint_model(tmp_path / "wide", channels=12)
     line = refusal(capsys, *arguments, "text=transformers", f"text.model={wide}")
     assert "(ViT-SO400M-14-SigLIP-384) gives vectors of 16 channels, and the words of 'wide' have 12" in line

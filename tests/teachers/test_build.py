@@ -1,4 +1,4 @@
-"""The teacher where none is named, and which words lead into the space of which teacher."""
+"""The teacher where none is named, and which words belong to the space of which teacher."""
 
 from copy import copy
 from dataclasses import replace
@@ -111,7 +111,7 @@ def test_a_table_that_is_given_means_labels_and_a_teacher_that_is_given_is_taken
 @pytest.mark.parametrize(
     ("teacher", "problem"),
     [
-        (PaletteConfig(), "no text tower leads into the features of teacher=palette"),
+        (PaletteConfig(), "no text tower shares the space of teacher=palette"),
         (RadioConfig(), "no text tower speaks for the features of RADIO's backbone"),
         (OnnxConfig(classes="c.npz"), "have vectors of their own"),
         (OnnxConfig(), "if teacher.joint=true says that both belong to one joint model"),

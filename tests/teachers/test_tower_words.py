@@ -1,4 +1,4 @@
-"""Words for the `transformers` teacher: which towers they lead into, and the commands from a scene to boxes."""
+"""Words for the `transformers` teacher: which towers they are of, and the commands from a scene to boxes."""
 
 import json
 from collections.abc import Callable
@@ -84,8 +84,8 @@ def test_a_summary_of_a_picture_of_one_patch_is_the_pictures_own(save_joint: Sav
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"dense": "tokens"}, "no words lead into hidden states"),
-        ({"layer": -2}, "no words lead into hidden states"),
+        ({"dense": "tokens"}, "no text tower shares the space of hidden states"),
+        ({"layer": -2}, "no text tower shares the space of hidden states"),
         ({"words": "w.safetensors"}, "both say what words are"),
     ],
 )
@@ -97,7 +97,7 @@ def test_a_tower_is_refused_for_vectors_that_it_does_not_speak_for(settings: dic
 def test_a_text_tower_is_refused_for_a_vision_tower_without_a_joint_space(save_joint, models):
     teacher = TransformersConfig(model=str(models / "llava"))
     text = TransformersTextConfig(model=str(save_joint("clip")))
-    with pytest.raises(InputError, match="no words lead into tokens after the final norm of llava"):
+    with pytest.raises(InputError, match="no text tower shares the space of tokens after the final norm of llava"):
         teacher.build(Scene(name="s"), words_of(teacher, text))
 
 

@@ -285,7 +285,9 @@ def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[BatchQuestio
         SceneWarning: names that no table knows, or none of which has a box.
     """
     if asker.words is None:
-        raise InputError(f"proposals=localize: no words lead into the features of {asker.scene.name}; give words=")
+        raise InputError(
+            f"proposals=localize: there is no text table for the features of {asker.scene.name}; give words="
+        )
     table = closed_table(asker.words)
     known_names = [name for name in names if table is None or table.find(name) is not None]
     if len(known_names) < len(names):

@@ -189,9 +189,7 @@ def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
 def _words_of_teacher(config: EvaluateConfig) -> Words:
     words = words_of(config.teacher, config.text)
     if words is None:
-        raise InputError(
-            f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words= or text="
-        )
+        raise InputError(f"evaluate: teacher {config.teacher.name} has no text table; give teacher.words= or text=")
     return words
 
 

@@ -91,7 +91,7 @@ def run(config: LocalizeCommandConfig, run: Run) -> None:
                     write_picture(target / f"{name}.png", picture)
         if cameras is not None:
             with run.step("from_pose"):
-                # Heads lead into other spaces than the one in which a memory attends.
+                # The outputs of heads are in other spaces than the one in which a memory attends.
                 memory = None if config.head else memory_of(folder, queried)
                 absent, drawn = localization.absent, config.pictures > 0
                 for pose_points, pose_pictures in search_from_poses(

@@ -172,7 +172,7 @@ def _prepare(
     device: torch.device,
     run: Run,
 ) -> dict[str, TextTable]:
-    """Prepares a scene for all teachers in folders of their own; the tables of words that lead into their features."""
+    """Prepares a scene for all teachers in folders of their own; the text tables of their spaces."""
     tables, spaces = {}, {}
     with run.step("encode"):
         predicted = predicted_features(scene, config) if config.weights else {}

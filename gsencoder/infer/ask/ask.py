@@ -213,7 +213,7 @@ class Asker:
     ) -> None:
         """Args:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
-        words: what leads into the features; None where nothing does.
+        words: words in the space of the features; None where there are none.
         vlm: how requests are made; pictures are made smaller than its `image_side`."""
         self.scene, self.words, self.space = scene, words, space
         self.table = closed_table(words) if words is not None else None
@@ -304,7 +304,9 @@ class Asker:
         if not words:
             return (), (), {}
         if self.words is None:
-            raise InputError(f"query: no words lead into the features of {self.scene.name}; give words= or aabb=")
+            raise InputError(
+                f"query: there is no text table for the features of {self.scene.name}; give words= or aabb="
+            )
         localization = localize(
             self.scene, words, self.words, self.localization, space=self.space, spacing=self._spacing
         )

@@ -166,7 +166,7 @@ class SceneSearch:
     """A scene that is asked many times; what does not depend on the word is computed once. May be asked from threads.
 
     Attributes:
-        words: turn words into the space of its features; None where none lead into it.
+        words: words in the space of its features; None where there are none.
         config: how words become boxes; the cosines are centered.
     """
 
@@ -192,7 +192,8 @@ class SceneSearch:
     def _encoder(self) -> Words:
         if self.words is None:
             raise InputError(
-                f"no words lead into these features ({self.shown.features.space.describe()}); they can be looked at"
+                f"there is no text table for these features ({self.shown.features.space.describe()}); they can be "
+                "looked at"
             )
         return self.words
 
