@@ -12,7 +12,7 @@ from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.page.page import MAGIC, Bundle, Container
-from gsencoder.infer.page.search import SceneSearch, drawn_scene, object_numbers
+from gsencoder.infer.page.search import SceneSearch, object_numbers, thin_for_display
 from gsencoder.text.table import WORDS_FILE, TextTable, load_text_table, make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
@@ -61,8 +61,8 @@ def save_viewed_room(folder: Path, rename: dict[str, str] | None = None, **chang
 
 def search_of(folder: Path, *, max_gaussians: int = 1_000_000) -> SceneSearch:
     """The search over the features in a folder."""
-    shown = drawn_scene(load_features(folder), "features", max_gaussians=max_gaussians)
-    return SceneSearch(shown=shown, words=load_text_table(folder / WORDS_FILE), config=LocalizeConfig())
+    shown = thin_for_display(load_features(folder), "features", max_gaussians=max_gaussians)
+    return SceneSearch(display=shown, words=load_text_table(folder / WORDS_FILE), config=LocalizeConfig())
 
 
 def read_container(data: bytes) -> Container:

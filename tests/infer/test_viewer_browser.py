@@ -70,7 +70,7 @@ def search(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> SceneSearc
     folder = tmp_path_factory.mktemp("seen")
     save_viewed_room(folder)
     search = search_of(folder / "features")
-    search.shown = replace(search.shown, scene=replace(search.shown.scene, views=scene.views))
+    search.display = replace(search.display, scene=replace(search.display.scene, views=scene.views))
     return search
 
 
@@ -131,13 +131,13 @@ def find_and_click_the_mug(page: Any, scene: Scene, search: SceneSearch) -> None
     room = after[:, : WIDTH - 300]
     assert np.quantile(np.ptp(room, axis=2), 0.9) < 30
     assert np.median(room) < 0.8 * np.median(before[:, : WIDTH - 300])
-    found = localize(search.shown.scene, ["mug"], search.words, search.config).boxes
+    found = localize(search.display.scene, ["mug"], search.words, search.config).boxes
     boxes = page.evaluate(
         "gsencoderViewer.shown[0].boxes.map(b => [b.center, b.size, b.probability, b.score, b.count])"
     )
     assert len(boxes) == len(found)
     center, size, probability, score, count = boxes[0]
-    np.testing.assert_allclose(center, found[0].obb_center - search.shown.scene.origin, atol=1e-6)
+    np.testing.assert_allclose(center, found[0].obb_center - search.display.scene.origin, atol=1e-6)
     np.testing.assert_allclose(size, found[0].obb_size)
     assert (count, probability, score) == (len(found[0].rows), found[0].probability, found[0].score)
     assert "mug" in page.inner_text(".label").lower()
@@ -171,7 +171,7 @@ def test_a_served_page_finds_what_is_typed(browser: Any, bundle: Bundle, search:
         expected = len(search.boxes("mug", 0.3)["boxes"])
         shown.wait_for_function(f"gsencoderViewer.shown[0].boxes.length == {expected}")
         told = shown.evaluate("async () => Array.from((await gsencoderViewer.shown[0].answers.ask('lamp')).relevancy)")
-        exact = relevancy(search.shown.features, search.words.encode(["lamp"]), search.words.mean)[0]
+        exact = relevancy(search.display.features, search.words.encode(["lamp"]), search.words.mean)[0]
         np.testing.assert_allclose(np.array(told, float), exact, atol=2e-5)
         assert np.isnan(exact).any()
         shown.fill("input[type=search]", "banjo")
@@ -191,7 +191,7 @@ def test_a_page_of_one_file_does_the_same_without_a_network(browser, bundle, sea
     page = opened_page(browser, (tmp_path / "page.html").as_uri(), offline=True)
     find_and_click_the_mug(page, scene, search)
     for name in ("mug", "lamp"):
-        exact = relevancy(search.shown.features, search.words.encode([name]), search.words.mean)[0]
+        exact = relevancy(search.display.features, search.words.encode([name]), search.words.mean)[0]
         told = page.evaluate(
             "async word => Array.from((await gsencoderViewer.shown[0].answers.ask(word)).relevancy, "
             "value => Number.isNaN(value) ? null : value)",
@@ -210,8 +210,8 @@ def test_a_page_of_one_file_does_the_same_without_a_network(browser, bundle, sea
 def test_two_folders_of_a_scene_stand_side_by_side_and_names_are_text(browser, bundle, tmp_path):
     save_viewed_room(tmp_path, rename={"mug": HOSTILE}, name="harm <script> 'x'")
     search = search_of(tmp_path / "features")
-    search.shown = replace(search.shown, title=HOSTILE)
-    containers = [file_container(search, search.shown.scene.objects, replace(OPTIONS, photographs=0))] * 2
+    search.display = replace(search.display, title=HOSTILE)
+    containers = [file_container(search, search.display.scene.objects, replace(OPTIONS, photographs=0))] * 2
     settings = {"kind": "file", "scenes": 2, "notes": [HOSTILE]}
     (tmp_path / "page.html").write_bytes(file_page(bundle, HOSTILE, settings, containers))
     page = opened_page(browser, (tmp_path / "page.html").as_uri(), offline=True)

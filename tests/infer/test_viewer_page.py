@@ -43,10 +43,10 @@ from gsencoder.infer.page.search import (
     RELEVANCY_STEP,
     UNSEEN,
     SceneSearch,
-    drawn_scene,
     object_numbers,
     pca_bytes,
     spz_bytes,
+    thin_for_display,
     weight_bytes,
 )
 from gsencoder.infer.relevancy import ThresholdConfig, feature_axes, relevancy, threshold
@@ -86,12 +86,12 @@ def small_search(
         **changes,  # type: ignore[arg-type]
     )
     table = replace(make_text_table(WORDS, np.eye(4, 6, dtype=np.float32), "table"), mean=np.zeros(6, np.float32))
-    return SceneSearch(shown=drawn_scene(scene, "few", max_gaussians=10**6), words=table, config=config)
+    return SceneSearch(display=thin_for_display(scene, "few", max_gaussians=10**6), words=table, config=config)
 
 
 def replace_shown(search: SceneSearch, scene: Scene, **changes: object) -> SceneSearch:
-    shown = replace(search.shown, scene=scene, **changes)  # type: ignore[arg-type]
-    return SceneSearch(shown=shown, words=search.words, config=search.config)
+    shown = replace(search.display, scene=scene, **changes)  # type: ignore[arg-type]
+    return SceneSearch(display=shown, words=search.words, config=search.config)
 
 
 def cosines_of_page(page: Container, word: int) -> np.ndarray:
@@ -143,7 +143,7 @@ def test_header_and_arrays_begin_at_multiples_of_eight_bytes(length: int) -> Non
 
 
 def test_relevancy_from_the_arrays_of_a_page_is_that_of_the_features_within_the_budget(search, written):
-    features = search.shown.features
+    features = search.display.features
     table = search.words
     budget = written.meta["featureError"]
     assert 0 < budget <= OPTIONS.error
@@ -159,7 +159,7 @@ def test_relevancy_from_the_arrays_of_a_page_is_that_of_the_features_within_the_
 def test_what_a_server_answers_is_the_relevancy_in_steps(search: SceneSearch) -> None:
     table = search.words
     for name in table.names:
-        exact = relevancy(search.shown.features, table.encode([name]), table.mean)[0]
+        exact = relevancy(search.display.features, table.encode([name]), table.mean)[0]
         answer = search.ask(name)
         seen = np.isfinite(exact)
         assert (answer.relevancy[~seen] == UNSEEN).all()
@@ -170,7 +170,7 @@ def test_what_a_server_answers_is_the_relevancy_in_steps(search: SceneSearch) ->
 @pytest.mark.filterwarnings("ignore:.*words have no box")
 def test_boxes_of_a_word_are_those_of_localize_at_any_threshold_and_a_file_has_those_of_all_words(search, written):
     for name, answer in zip(search.words.names, written.meta["answers"], strict=True):
-        localization = localize(search.shown.scene, [name], search.words, search.config)
+        localization = localize(search.display.scene, [name], search.words, search.config)
         sent = search.boxes(name)
         assert sent["boxes"] == answer["boxes"] == [box_to_json(box) for box in localization.boxes]
         assert sent["probability"] == answer["probability"] == float(localization.probabilities[0])
@@ -179,14 +179,14 @@ def test_boxes_of_a_word_are_those_of_localize_at_any_threshold_and_a_file_has_t
     assert search.boxes("piano")["boxes"] == []
     assert search.boxes("piano")["probability"] < 0.02
     config = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.9))
-    expected = localize(search.shown.scene, ["mug"], search.words, config)
+    expected = localize(search.display.scene, ["mug"], search.words, config)
     assert search.boxes("mug", 0.9)["boxes"] == [box_to_json(box) for box in expected.boxes]
     assert search.boxes("mug", 0.9)["boxes"] != search.boxes("mug")["boxes"]
 
 
 def test_thinned_gaussians_cover_as_much_as_all_and_keep_their_weights(search: SceneSearch) -> None:
-    whole = search.shown
-    thin = drawn_scene(whole.scene, "t", max_gaussians=1289, advice="more fits elsewhere")
+    whole = search.display
+    thin = thin_for_display(whole.scene, "t", max_gaussians=1289, advice="more fits elsewhere")
     rows = np.linspace(0, len(whole.gaussians) - 1, 1289).round().astype(int)
     area = len(whole.gaussians) / 1289
     np.testing.assert_allclose(thin.gaussians.scales, whole.gaussians.scales[rows] * area**0.5, rtol=1e-5)
@@ -199,8 +199,10 @@ def test_a_table_that_gaussians_share_stays_whole_where_they_are_thinned(search:
     index = np.array([0, 1, 1, -1], np.int32)
     weights = np.array([1, 2, 3, 0], np.float32)
     features = replace(features_of(np.eye(2, 6), np.ones(2)), index=index, weights=weights)
-    scene = replace(search.shown.scene, gaussians=search.shown.gaussians.select(np.arange(4)), features={"f": features})
-    thin = drawn_scene(scene, "t", max_gaussians=2).features
+    scene = replace(
+        search.display.scene, gaussians=search.display.gaussians.select(np.arange(4)), features={"f": features}
+    )
+    thin = thin_for_display(scene, "t", max_gaussians=2).features
     assert (thin.weights.tolist(), len(thin.features)) == ([1, 0], 2)
     np.testing.assert_array_equal(thin.index, [0, -1])
 
@@ -245,26 +247,26 @@ def test_boxes_of_objects_are_in_world_coordinates_enlarged_and_the_smallest_vol
 
 
 def test_margins_of_objects_are_half_a_spacing(search: SceneSearch) -> None:
-    scene = search.shown.scene
+    scene = search.display.scene
     named = replace(ROOM.objects[0], name=None)
     made = scene_container(search, (named, *ROOM.objects[1:]))
     assert made.meta["objects"][0] == ""
     objects = (named, *ROOM.objects[1:])
-    expected = object_numbers(search.shown.gaussians.means, objects, scene.origin, 0.5 * search.spacing)
+    expected = object_numbers(search.display.gaussians.means, objects, scene.origin, 0.5 * search.spacing)
     np.testing.assert_array_equal(made.arrays["objects"], expected)
     far = replace_shown(search, replace(scene, origin=scene.origin + 100))
     assert not scene_container(far, objects).arrays["objects"].any()
 
 
 def test_a_page_knows_the_units_the_weights_and_the_cameras_of_its_scene(search: SceneSearch) -> None:
-    scene = replace(search.shown.scene, metres_per_unit=0.25, origin=np.array([1.0, -2.0, 3.0]), views=ROOM.views)
-    other = SceneSearch(shown=replace(search.shown, scene=scene), words=search.words, config=search.config)
+    scene = replace(search.display.scene, metres_per_unit=0.25, origin=np.array([1.0, -2.0, 3.0]), views=ROOM.views)
+    other = SceneSearch(display=replace(search.display, scene=scene), words=search.words, config=search.config)
     made = read_container(file_container(other, (), replace(OPTIONS, photographs=0)).to_bytes())
     assert made.meta["metresPerUnit"] == 0.25
     assert made.meta["origin"] == [1, -2, 3]
     assert made.meta["photographs"] is False
-    assert made.meta["weights"] == list(weight_bytes(search.shown.features.weights)[1:])
-    assert made.meta["floor"] == feature_axes(search.shown.features).floor > 0
+    assert made.meta["weights"] == list(weight_bytes(search.display.features.weights)[1:])
+    assert made.meta["floor"] == feature_axes(search.display.features).floor > 0
     cameras = ROOM.views.cameras
     assert made.arrays["sizes"].tolist() == np.stack([cameras.widths, cameras.heights], axis=1).tolist()
     np.testing.assert_array_equal(made.arrays["camFromWorld"], cameras.cam_from_world)
@@ -272,7 +274,7 @@ def test_a_page_knows_the_units_the_weights_and_the_cameras_of_its_scene(search:
 
 def test_options_of_a_file_bound_harmonics_features_and_photographs(search: SceneSearch, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    scene = search.shown.scene
+    scene = search.display.scene
     sh = np.concatenate([scene.gaussians.sh, 0.1 * rng.normal(size=(len(scene.gaussians), 8, 3))], axis=1)
     rich = replace_shown(
         search, replace(scene, gaussians=replace(scene.gaussians, sh=sh.astype(np.float32)), views=ROOM.views)
@@ -327,7 +329,7 @@ def test_words_of_gaussians_are_weighed_and_the_same_where_features_lie_in_a_bas
     )
     inside = vectors @ turn
     features = plain_features(inside, SPACE, weights, basis=basis)
-    scene = replace(plain.shown.scene, features={"names": features})
+    scene = replace(plain.display.scene, features={"names": features})
     expected = small_search(inside @ turn.T, weights).best_words([0, 1, 2, 3])
     turned = replace_shown(plain, scene).best_words([0, 1, 2, 3])
     assert [name for name, _ in turned] == [name for name, _ in expected]
@@ -344,17 +346,17 @@ def test_a_scene_in_which_nothing_was_seen_has_no_threshold_and_no_labels() -> N
 
 def test_the_spacing_of_one_gaussian_is_its_size_and_another_space_is_refused() -> None:
     one = small_search(np.eye(6)[:1], np.ones(1))
-    assert one.spacing == pytest.approx(np.median(one.shown.gaussians.scales))
+    assert one.spacing == pytest.approx(np.median(one.display.gaussians.scales))
     other = make_text_table(WORDS, np.eye(4, 6, dtype=np.float32), "another encoder")
     with pytest.raises(InputError, match="use the text encoder 'table'"):
-        SceneSearch(shown=one.shown, words=other, config=LocalizeConfig())
+        SceneSearch(display=one.display, words=other, config=LocalizeConfig())
 
 
-def test_features_without_words_are_shown_and_say_that_none_lead_into_them(search: SceneSearch) -> None:
-    features = search.shown.features
+def test_features_without_words_are_shown_and_say_that_there_are_none(search: SceneSearch) -> None:
+    features = search.display.features
     space = replace(features.space, name="dense", text_encoder="")
-    scene = replace(search.shown.scene, features={"dense": replace(features, space=space)})
-    mute = SceneSearch(shown=drawn_scene(scene, "t", max_gaussians=10**6), words=None, config=LocalizeConfig())
+    scene = replace(search.display.scene, features={"dense": replace(features, space=space)})
+    mute = SceneSearch(display=thin_for_display(scene, "t", max_gaussians=10**6), words=None, config=LocalizeConfig())
     with pytest.raises(InputError, match="there is no text table for these features"):
         mute.ask("mug")
     assert mute.best_words([0]) == []
@@ -430,7 +432,7 @@ def colored(scene: Scene, degree: int) -> Scene:
 
 
 def fitted(search: SceneSearch, limit: int, *degrees: int, options: FileOptions = OPTIONS, **further: int) -> PageFile:
-    scenes = [(colored(search.shown.scene, degree), f"t{degree}", search.words) for degree in degrees]
+    scenes = [(colored(search.display.scene, degree), f"t{degree}", search.words) for degree in degrees]
     limits = {"max_gaussians": 10**6, "max_bytes": limit} | further
     return fitting_page(STUB, scenes, LocalizeConfig(), ROOM.objects, options, **limits)
 
@@ -442,7 +444,7 @@ def scenes_of(made: PageFile) -> list[Container]:
 
 def test_a_page_holds_all_up_to_its_last_byte_and_says_what_it_knows(search: SceneSearch) -> None:
     whole = fitted(search, 10**7, 1)
-    count = len(search.shown.gaussians)
+    count = len(search.display.gaussians)
     assert [(meta["shDegree"], meta["count"]) for meta in whole.metas] == [(1, count)]
     assert whole.notes[0] == f"This file knows {len(search.words.names)} words."
     assert any("were seen by no view" in note for note in whole.notes)
@@ -458,7 +460,7 @@ def test_a_page_holds_all_up_to_its_last_byte_and_says_what_it_knows(search: Sce
 def test_a_thinned_page_uses_most_of_its_size_whatever_was_asked_for(search: SceneSearch) -> None:
     whole = fitted(search, 10**7, 0)
     limit = len(whole.page) // 2
-    for most in (10**6, len(search.shown.gaussians)):
+    for most in (10**6, len(search.display.gaussians)):
         made = fitted(search, limit, 0, max_gaussians=most)
         assert 0.6 * limit < len(made.page) <= limit
         assert any("megabytes= or max_gaussians= takes more" in note for note in made.notes)

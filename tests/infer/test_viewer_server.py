@@ -89,9 +89,9 @@ def searches(tmp_path_factory: pytest.TempPathFactory) -> list[SceneSearch]:
     folder = tmp_path_factory.mktemp("requests")
     save_viewed_room(folder)
     first = search_of(folder / "features")
-    first.shown = replace(first.shown, scene=replace(first.shown.scene, views=room_scene().views))
+    first.display = replace(first.display, scene=replace(first.display.scene, views=room_scene().views))
     second = search_of(folder / "features", max_gaussians=2000)
-    second.shown = replace(second.shown, scene=replace(second.shown.scene, views=None))
+    second.display = replace(second.display, scene=replace(second.display.scene, views=None))
     second.config = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.37))
     return [first, second]
 
@@ -104,7 +104,7 @@ def server(searches: list[SceneSearch]) -> Iterator[ViewServer]:
 
 def test_each_scene_is_answered_under_its_own_number(server: ViewServer, searches: list[SceneSearch]) -> None:
     for number, search in enumerate(searches):
-        count = len(search.shown.gaussians)
+        count = len(search.display.gaussians)
         assert read_container(call(server, "GET", at(server, f"scene/{number}"))[1]).meta["count"] == count
         labels = read_container(call(server, "GET", at(server, f"labels/{number}"))[1])
         np.testing.assert_array_equal(labels.arrays["numbers"], search.labels.numbers)
@@ -134,7 +134,7 @@ def test_what_is_no_number_of_a_scene_is_refused(server: ViewServer, scene: Any)
 
 
 def test_what_is_as_large_as_it_may_be_is_answered(server: ViewServer, searches: list[SceneSearch]) -> None:
-    count = len(searches[0].shown.gaussians)
+    count = len(searches[0].display.gaussians)
     # Nobody knows the word, but it is one.
     assert call(server, "POST", at(server, "ask"), {"scene": 0, "word": "x" * MAX_WORD})[0] == 422
     for rows, status in (([count - 1] * MAX_ROWS, 200), ([count], 400), ([0, -1], 400)):

@@ -17,7 +17,7 @@ from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, select_features
 from gsencoder.infer.page.page import Bundle, FileOptions, fitting_page, load_bundle, scene_container, served_page
-from gsencoder.infer.page.search import SceneSearch, drawn_scene
+from gsencoder.infer.page.search import SceneSearch, thin_for_display
 from gsencoder.infer.page.server import ViewServer
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
@@ -117,7 +117,9 @@ def _serve(
 ) -> None:
     searches = [
         SceneSearch(
-            shown=drawn_scene(scene, title, max_gaussians=config.max_gaussians), words=words, config=config.localize
+            display=thin_for_display(scene, title, max_gaussians=config.max_gaussians),
+            words=words,
+            config=config.localize,
         )
         for (scene, words), title in zip(loaded, titles, strict=True)
     ]

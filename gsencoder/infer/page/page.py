@@ -31,7 +31,14 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
 from gsencoder.fusion.quantize import compact
 from gsencoder.infer.localize import LocalizeConfig, select_features
-from gsencoder.infer.page.search import SceneSearch, drawn_scene, object_numbers, pca_bytes, spz_bytes, weight_bytes
+from gsencoder.infer.page.search import (
+    SceneSearch,
+    object_numbers,
+    pca_bytes,
+    spz_bytes,
+    thin_for_display,
+    weight_bytes,
+)
 from gsencoder.infer.relevancy import feature_axes, word_directions
 from gsencoder.text.vocabulary import OpenVocabulary, Words, closed_table
 from gsencoder.types import Scene, SceneObject, Views
@@ -166,17 +173,17 @@ class FileOptions:
 
 def scene_container(search: SceneSearch, objects: tuple[SceneObject, ...], *, sh_degree: int = 3) -> Container:
     """What a page needs of a scene whose words a server answers; boxes of labeled objects are in world coordinates."""
-    shown = search.shown
-    scene, gaussians, features = shown.scene, shown.gaussians, shown.features
+    display = search.display
+    scene, gaussians, features = display.scene, display.gaussians, display.features
     codes, lightest, heaviest = weight_bytes(features.weights)
     splat = np.frombuffer(spz_bytes(gaussians, sh_degree=sh_degree), np.uint8)
     meta: dict[str, Any] = {
         "name": scene.name,
-        "title": shown.title,
+        "title": display.title,
         "space": features.space.describe(),
         "count": len(gaussians),
-        "total": shown.total,
-        "notes": list(shown.notes),
+        "total": display.total,
+        "notes": list(display.notes),
         "origin": scene.origin,
         "up": scene.up,
         "metresPerUnit": scene.metres_per_unit,
@@ -210,7 +217,7 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     with vector t in `words` is z·t / √(|z|² + floor), since the basis is orthonormal and its mean is what centered
     cosines remove."""
     base = scene_container(search, objects, sh_degree=options.sh_degree)
-    compacted = compact(search.shown.features, error=options.error)
+    compacted = compact(search.display.features, error=options.error)
     table = search.table
     directions = np.zeros((0, compacted.space.channels))
     if table is not None:
@@ -219,7 +226,7 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     seen[compacted.rows] = True
     labels = search.labels
     words = directions @ compacted.basis.components.astype(np.float64).T
-    views, listed = search.shown.scene.views, list[int]()
+    views, listed = search.display.scene.views, list[int]()
     if views is not None and views.images is not None and options.photographs:
         # Evenly spaced where there are more than a page holds.
         listed = even_indices(len(views), options.photographs).tolist()
@@ -227,7 +234,7 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     meta = {
         **base.meta,
         "rank": compacted.basis.rank,
-        "floor": feature_axes(search.shown.features).floor,
+        "floor": feature_axes(search.display.features).floor,
         "featureError": compacted.error,
         "answers": search.answers,
         "labels": list(labels.names),
@@ -313,7 +320,9 @@ def fitting_page(
         )
         searches = searches or [
             SceneSearch(
-                shown=drawn_scene(scene, title, max_gaussians=limit, advice="megabytes= or max_gaussians= takes more"),
+                display=thin_for_display(
+                    scene, title, max_gaussians=limit, advice="megabytes= or max_gaussians= takes more"
+                ),
                 words=words,
                 config=config,
             )

@@ -46,7 +46,7 @@ class DisplayScene:
         return next(iter(self.scene.features.values()))
 
 
-def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "") -> DisplayScene:
+def thin_for_display(scene: Scene, title: str, *, max_gaussians: int, advice: str = "") -> DisplayScene:
     """A scene with at most `max_gaussians`, evenly chosen and enlarged so that surfaces stay closed; a note about that
     ends with `advice`."""
     gaussians, features = select_features(scene, None)
@@ -170,7 +170,7 @@ class SceneSearch:
         config: how words become boxes; the cosines are centered.
     """
 
-    shown: DisplayScene
+    display: DisplayScene
     words: Words | None
     config: LocalizeConfig
     products: GaussianProducts = field(init=False)
@@ -180,9 +180,9 @@ class SceneSearch:
 
     def __post_init__(self) -> None:
         if self.words is not None:
-            check_space(self.shown.features.space, self.words.space)
-        self.products = GaussianProducts(self.shown.features)
-        self.spacing = spacing_of(self.shown.gaussians)
+            check_space(self.display.features.space, self.words.space)
+        self.products = GaussianProducts(self.display.features)
+        self.spacing = spacing_of(self.display.gaussians)
 
     @property
     def table(self) -> TextTable | None:
@@ -192,7 +192,7 @@ class SceneSearch:
     def _encoder(self) -> Words:
         if self.words is None:
             raise InputError(
-                f"there is no text table for these features ({self.shown.features.space.describe()}); they can be "
+                f"there is no text table for these features ({self.display.features.space.describe()}); they can be "
                 "looked at"
             )
         return self.words
@@ -232,7 +232,7 @@ class SceneSearch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SceneWarning)
             # The spacing takes most of the time.
-            localized = localize(self.shown.scene, names, words, config, spacing=self.spacing)
+            localized = localize(self.display.scene, names, words, config, spacing=self.spacing)
         return [
             {
                 "boxes": [box_to_json(box) for box in localized.boxes if box.query == name],
@@ -244,7 +244,7 @@ class SceneSearch:
 
     def best_words(self, rows: Sequence[int]) -> list[tuple[str, float]]:
         """The known words nearest to the mean direction of some Gaussians, best first, with their cosines."""
-        features = self.shown.features
+        features = self.display.features
         chosen = np.asarray(rows, np.int64)
         chosen = chosen[features.seen[chosen]]
         table = self.table
@@ -259,7 +259,7 @@ class SceneSearch:
     @cached_property
     def labels(self) -> Labels:
         """The best known word of every Gaussian, of the `LABELS` words that are the best of most weight."""
-        features, table = self.shown.features, self.table
+        features, table = self.display.features, self.table
         if table is None:
             return Labels(names=(), numbers=np.full(len(features), NO_LABEL, np.uint16))
         targets = self.products.axes.project(word_directions(table.embeddings, table.mean)).astype(np.float32)
@@ -281,7 +281,7 @@ class SceneSearch:
         best, cosines = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.float32)
         for start in range(0, len(rows), LABEL_BLOCK):
             block = slice(start, start + LABEL_BLOCK)
-            local = self.products.axes.directions_of(self.shown.features.stored(rows[block])).astype(np.float32)
+            local = self.products.axes.directions_of(self.display.features.stored(rows[block])).astype(np.float32)
             products = local @ targets.T
             best[block], cosines[block] = products.argmax(axis=1), products.max(axis=1)
         return best, cosines

@@ -174,7 +174,7 @@ class _Handler(BaseHTTPRequestHandler):
                 labels = server.search_of(_parse_index(number)).labels
                 return Container(meta={"names": labels.names}, arrays={"numbers": labels.numbers}).to_bytes(), BINARY
             case ["photograph", number, view]:
-                views = server.search_of(_parse_index(number)).shown.scene.views
+                views = server.search_of(_parse_index(number)).display.scene.views
                 return jpeg_of(views, _parse_index(view), PHOTOGRAPH_SIDE), "image/jpeg"
         raise RefusedError(HTTPStatus.NOT_FOUND, "there is nothing at this address")
 
@@ -187,7 +187,7 @@ class _Handler(BaseHTTPRequestHandler):
         request = self._body()
         search = self.server.search_of(request.get("scene"))
         if path == ["words"]:
-            rows, count = request.get("rows"), len(search.shown.gaussians)
+            rows, count = request.get("rows"), len(search.display.gaussians)
             if (
                 not isinstance(rows, list)
                 or not 0 < len(rows) <= MAX_ROWS

@@ -171,7 +171,7 @@ def test_harmonics_stay_and_the_last_line_names_their_degree(tmp_path, capsys):
     assert [scene.meta["title"] for scene in scenes] == [str(each) for each in folders]
 
 
-def test_features_that_no_words_lead_into_are_shown_unless_words_are_given(folder, tmp_path, capsys):
+def test_features_without_words_are_shown_unless_words_are_given(folder, tmp_path, capsys):
     features, _ = name_features(ROOM)
     dense = replace(features, space=replace(features.space, name="dense", text_encoder=""))
     (tmp_path / "dense").mkdir()
@@ -216,9 +216,9 @@ def test_the_server_gets_the_scene_as_it_is_to_be_searched(folder, served, capsy
     assert cli.main(["view", str(folder / "features"), f"photos={folder / 'room'}", *arguments]) == 0
     assert served.options == {"port": 4321}
     (search,) = served.searches
-    assert len(search.shown.gaussians) == 1500
+    assert len(search.display.gaussians) == 1500
     assert search.config.min_probability == 0.1
-    assert search.shown.title == "features"
+    assert search.display.title == "features"
     assert any(served.scenes[0].meta["objects"])
     assert served.scenes[0].meta["photographs"] is True
     assert served.closed
