@@ -100,7 +100,7 @@ def test_steps_of_several_threads_share_the_seconds_of_the_wall_clock() -> None:
         assert list(ahead(timed("blend")(work), range(6), 3)) == [*range(6)]
     wall = time.perf_counter() - start
     assert clock.seconds["teacher"] == 2.0
-    assert 0.8 * wall < clock.seconds["blend"] <= wall
+    assert 2 * 0.02 <= clock.seconds["blend"] <= wall
 
 
 @pytest.mark.parametrize("training", [False, True])

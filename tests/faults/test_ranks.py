@@ -1,6 +1,5 @@
 """Two processes of one training: one dies, hangs, or has other settings or weights. The other ends and says so."""
 
-import json
 import time
 from pathlib import Path
 
@@ -35,6 +34,8 @@ def train(how, process, device):
         network, samples(dataset, names), LOSSES, SHORT, folder=work, settings=settings, process=process, device=device
     )
     def lost(config, step, final: float):
+        if step == 1 and how == "hangs":
+            distributed.STEP_MINUTES = 1 / 30
         if step == 2 and rank and how in ("dies", "hangs"):
             (folder / "lost").touch()
             os._exit(9) if how == "dies" else time.sleep(60)
@@ -43,7 +44,6 @@ def train(how, process, device):
     TrainerConfig.rate_at = lost
     trainer.run()
 
-distributed.STEP_MINUTES = 1 / 30
 presence.BEAT_SECONDS = 0.3
 for how in sys.argv[2:]:
     said = "ended"
@@ -104,10 +104,7 @@ def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_wai
 
 @pytest.mark.alone
 def test_a_process_whose_other_dies_ends_at_once(tmp_path: Path, ranks: RankServer) -> None:
-    began = time.monotonic()
     messages = outcomes(ranks, tmp_path, "dies")["dies"]
     assert messages[0].startswith("training: process 0 of 2: process 1 ended; ")
     assert messages[1] == ""
     assert time.time() - (tmp_path / "lost").stat().st_mtime < 30
-    assert time.monotonic() - began < 120
-    assert json.dumps(messages)
