@@ -20,7 +20,7 @@ from gsencoder.app.compose import compose
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.checkpoint import CachedTeacher
-from gsencoder.memory.reduction import CoverReduction, reduce_as_published, unit_rows
+from gsencoder.memory.reduction import CoverReduction, reduce_algorithm1, unit_rows
 from gsencoder.teachers.build import words_of
 
 CHUNK = 5000
@@ -40,7 +40,7 @@ def raw_features(scene_path: Path, teacher_words: list[str], maps: Path | None) 
 
 
 def reduce_to_published(features: np.ndarray, threshold: float) -> np.ndarray:
-    return reduce_as_published(unit_rows(features), threshold)[0]
+    return reduce_algorithm1(unit_rows(features), threshold)[0]
 
 
 def reduce_to_cover(features: np.ndarray, threshold: float) -> np.ndarray:

@@ -17,7 +17,7 @@ from gsencoder.memory.reduction import (
     ROUNDING,
     CoverReduction,
     largest_threshold,
-    reduce_as_published,
+    reduce_algorithm1,
     unit_rows,
 )
 from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank
@@ -242,7 +242,7 @@ class _Builder:
                 file.append(unit_rows(rows[directed]))
             unit = file.array()
             count = len(unit)
-            chosen, _ = reduce_as_published(unit, threshold, drop_last=self._config.drop_last)
+            chosen, _ = reduce_algorithm1(unit, threshold, drop_last=self._config.drop_last)
             del unit
         if count and not len(chosen):
             raise InputError(

@@ -35,7 +35,7 @@ def unit_rows(rows: Float32[np.ndarray, "n D"]) -> Float32[np.ndarray, "n D"]:
     return np.asarray(scaled / np.sqrt(np.einsum("nd,nd->n", scaled, scaled))[:, None], np.float32)
 
 
-def reduce_as_published(
+def reduce_algorithm1(
     unit: Float32[np.ndarray, "n D"], threshold: float, *, drop_last: int = 0
 ) -> tuple[Int64[np.ndarray, " M"], Bool[np.ndarray, " n"]]:
     """M3's Algorithm 1: a row becomes a component if no row within the threshold of it is in use; then all rows within

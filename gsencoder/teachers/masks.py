@@ -30,7 +30,7 @@ from gsencoder.teachers.pictures import photograph, read_preprocessing
 from gsencoder.types import Scene, Views
 from gsencoder.types.orientation import turned
 
-WHAT = "teacher regions"
+LABEL = "teacher regions"
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 
 
@@ -216,34 +216,34 @@ class SamMasks:
         if not model:
             raise InputError("teacher.sam= is missing: the folder of a SAM model, for masks=sam")
         folder = find_file(model, "teacher.sam", folder=True)
-        kind = read_config(folder, WHAT).model_type
+        kind = read_config(folder, LABEL).model_type
         if kind not in (*SAM, *SAM2):
-            raise InputError(f"{WHAT}: {folder} holds a {kind} model, expected sam or sam2")
+            raise InputError(f"{LABEL}: {folder} holds a {kind} model, expected sam or sam2")
         import transformers
 
         self.options, self._is_first = options, kind in SAM
         loader = transformers.SamModel if self._is_first else transformers.Sam2Model
         # The published SAM2 is a model of videos, whose memory is no part of one of pictures.
-        network = load_pretrained(loader, folder, WHAT, ignored=() if self._is_first else ANY)
+        network = load_pretrained(loader, folder, LABEL, ignored=() if self._is_first else ANY)
         if self._is_first:
-            self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
+            self._processor = load_companion(transformers.AutoImageProcessor, folder, LABEL, "preprocessing")
         else:
             self._side = int(network.config.prompt_encoder_config.image_size)
             # The preprocessing of SAM2 in transformers needs torchvision: a squeeze to a square, and these colors.
-            self._colors = read_preprocessing(folder, WHAT)
+            self._colors = read_preprocessing(folder, LABEL)
         self._device = choose_device(device)
         self._model = network.to(self._device)
         self._digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("*.json")]))
 
     def labels(self, views: Views, view: int) -> Int32[np.ndarray, "H W"]:
         """The masks of a photograph, numbered from 1 from the largest to the smallest."""
-        image = photograph(views, view, f"{WHAT}: masks=sam")
+        image = photograph(views, view, f"{LABEL}: masks=sam")
         try:
             staying = suppress(self.proposals(image), self.options.max_overlap)
         except (InputError, RuntimeError) as error:
             message = " ".join(str(error).split())[:200]
             advice = "" if isinstance(error, InputError) else "; expected a configuration and weights of one SAM model"
-            raise InputError(f"{WHAT}: view {views.names[view]!r}: {message}{advice}") from error
+            raise InputError(f"{LABEL}: view {views.names[view]!r}: {message}{advice}") from error
         return paint(staying, image.shape[:2])
 
     def proposals(self, image: UInt8[np.ndarray, "H W 3"]) -> Iterator[Proposal]:
@@ -254,7 +254,7 @@ class SamMasks:
         prepared = self._prepare(image)
         size = image.shape[0], image.shape[1]
         for score, logits in sorted(self._candidates(prepared), key=lambda candidate: -candidate[0]):
-            with enough_memory(WHAT, "teacher.points="):
+            with enough_memory(LABEL, "teacher.points="):
                 proposal = self._proposal(self._logits_of_picture(logits, prepared, size), score)
             if proposal is not None:
                 yield proposal
@@ -264,7 +264,7 @@ class SamMasks:
         tensor, rows, columns = prepared
         points = grid_points(self.options.points) * np.array([columns, rows], np.float32)
         candidates: list[tuple[float, Any]] = []
-        with torch.inference_mode(), enough_memory(WHAT, "teacher.points="):
+        with torch.inference_mode(), enough_memory(LABEL, "teacher.points="):
             embeddings = self._model.get_image_embeddings(tensor)
             for start in range(0, len(points), POINTS_AT_ONCE):
                 chunk = torch.from_numpy(points[start : start + POINTS_AT_ONCE]).to(self._device)

@@ -41,7 +41,7 @@ from gsencoder.teachers.pictures import Preprocessing, TorchTeacher
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import FeatureSpace, Scene
 
-WHAT = "teacher radio"
+LABEL = "teacher radio"
 ADAPTERS = "radio_model.adaptors."
 """The prefix of the keys of adapter heads in files of weights."""
 PICKLED = (".tar", ".pth", ".pt", ".bin", ".ckpt")
@@ -95,7 +95,7 @@ class RadioNetwork(nn.Module):
         from transformers import AutoModel
 
         super().__init__()
-        self._model = load_pretrained(AutoModel, folder, WHAT, ignored=(ADAPTERS,))
+        self._model = load_pretrained(AutoModel, folder, LABEL, ignored=(ADAPTERS,))
         self.patch, self.channels = int(self._model.config.patch_size), int(self._model.config.hidden_size)
 
     def forward(self, pixels: Float[Tensor, "1 3 H W"]) -> Float[Tensor, "h w D"]:
@@ -108,7 +108,7 @@ class RadioNetwork(nn.Module):
 class RadioTeacher(TorchTeacher):
     """The backbone's patch features as they are: adapter heads lead from them into other spaces."""
 
-    subject = WHAT
+    subject = LABEL
     preprocessing = Preprocessing()
 
     def __init__(self, config: RadioConfig, *, text_encoder: str = "") -> None:
@@ -134,7 +134,7 @@ def radio_folder(config: RadioConfig) -> Path:
         raise InputError("teacher.model= is missing: the folder of a RADIO model")
     if config.model.lower().endswith(PICKLED) or Path(config.model).is_file():
         raise InputError(
-            f"{WHAT}: teacher.model={config.model} is a file, and files of pickles, such as .pth.tar, are never "
+            f"{LABEL}: teacher.model={config.model} is a file, and files of pickles, such as .pth.tar, are never "
             "opened; give the folder of the Hugging Face release, with config.json and safetensors"
         )
     return find_file(config.model, "teacher.model", folder=True)
@@ -142,9 +142,9 @@ def radio_folder(config: RadioConfig) -> Path:
 
 def check_radio(folder: Path) -> int:
     """Checks that a folder states that it holds a RADIO model; returns the channels of its backbone."""
-    model_config = read_config(folder, WHAT)
+    model_config = read_config(folder, LABEL)
     if model_config.model_type != "radio":
-        raise InputError(f"{WHAT}: {folder} holds a {model_config.model_type} model, expected radio")
+        raise InputError(f"{LABEL}: {folder} holds a {model_config.model_type} model, expected radio")
     return int(model_config.hidden_size)
 
 
@@ -165,7 +165,7 @@ def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[
         names: of heads: NAME, NAME.summary or NAME.features.
         channels: D of the backbone.
     """
-    files = weight_names(folder, WHAT)
+    files = weight_names(folder, LABEL)
     with error_prefix(f"heads of {folder}"):
         config = _read_config(folder)
         heads = [_read_head(folder, files, config, name, channels) for name in names]
@@ -207,7 +207,7 @@ def _read_head(folder: Path, files: Mapping[str, Path], config: Mapping[str, Any
                 f"takes {sizes['input_dim']} channels and the backbone has {channels}: a head of another backbone"
             )
         prefix = f"{ADAPTERS}{adapter}.{MODULES[part]}."
-        body = _make_body(read_weights(files, prefix, folder, WHAT), prefix, version, sizes)
+        body = _make_body(read_weights(files, prefix, folder, LABEL), prefix, version, sizes)
     return Head(name=full, body=body.requires_grad_(False).eval(), text=kind, model=str(teacher.get("model", "")))
 
 

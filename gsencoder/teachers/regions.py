@@ -30,7 +30,7 @@ from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.teachers.base import MissingInput, Teacher, TeacherSettings, check_channels, settings_of, text_encoder_of
 from gsencoder.teachers.labels import codes_of
 from gsencoder.teachers.masks import (
-    WHAT,
+    LABEL,
     FileMasks,
     InstanceMasks,
     RegionMasks,
@@ -141,12 +141,12 @@ class RegionsConfig(TeacherSettings, SamOptions):
     def build(self, scene: Scene, words: Words | None) -> Teacher:
         if self.vector == "captions" and words is None:
             raise InputError(
-                f"{WHAT}: captions need words: give a text tower (text=onnx text.model=FOLDER), or a text table "
+                f"{LABEL}: captions need words: give a text tower (text=onnx text.model=FOLDER), or a text table "
                 "that has them (teacher.words=)"
             )
         masks = self._masks(scene)
         if scene.views is None:
-            raise InputError(f"{WHAT}: the scene has no views")
+            raise InputError(f"{LABEL}: the scene has no views")
         if words is not None and self.vector == "captions":
             captions, source = self._captions(scene, scene.views, masks)
             return CaptionedRegions(scene.views, masks, captions, words, rest=self.rest == "mean", source=source)
@@ -179,13 +179,13 @@ class RegionsConfig(TeacherSettings, SamOptions):
             names = {item.id: item.name for item in scene.objects if item.name is not None}
             if not names:
                 raise InputError(
-                    f"{WHAT}: masks=instances: no object of the scene has a name (objects.json); give "
+                    f"{LABEL}: masks=instances: no object of the scene has a name (objects.json); give "
                     "a JSON file of captions, teacher.captions="
                 )
             return dict.fromkeys(views.names, names), OBJECTS
         if not path.is_file():
             raise InputError(
-                f"{WHAT}: {path}: no such file; vector=captions needs captions of the labels: give "
+                f"{LABEL}: {path}: no such file; vector=captions needs captions of the labels: give "
                 "teacher.captions=, or vector=map or vector=crop"
             )
         return read_captions(path, views.names), str(path)
@@ -213,7 +213,7 @@ def dense_settings(config: RegionsConfig) -> TeacherSettings:
         options = {item.name: getattr(config.onnx, item.name) for item in fields(DenseOnnxOptions)}
         return OnnxConfig(model=config.model, **{**options, "size": config.onnx.size or OnnxConfig().size})
     folder = find_file(config.model, "teacher.model", folder=True)
-    if read_config(folder, WHAT).model_type == "radio":
+    if read_config(folder, LABEL).model_type == "radio":
         return RadioConfig(model=config.model, device=config.device)
     return TransformersConfig(model=config.model, device=config.device)
 
@@ -295,7 +295,7 @@ class CaptionedRegions:
         self.kinds = tuple(sorted(used))
         self.captions = (*([""] if rest else []), *self.kinds)
         self.mean = words.mean
-        with error_prefix(f"{WHAT}: captions"):
+        with error_prefix(f"{LABEL}: captions"):
             vectors = words.encode(self.kinds)
         if rest:
             direction = words.mean.astype(np.float64)
@@ -323,21 +323,21 @@ class CaptionedRegions:
             bare.update(without)
             regions = [regions[0] + len(labels), regions[1] + len(without)]
         if not everywhere:
-            raise InputError(f"{WHAT}: the masks of all {len(views)} views are empty: they have no label above 0")
+            raise InputError(f"{LABEL}: the masks of all {len(views)} views are empty: they have no label above 0")
         if not used:
             raise InputError(
-                f"{WHAT}: {self._source}: none of its captions belongs to one of the {regions[0]:,} regions, whose "
+                f"{LABEL}: {self._source}: none of its captions belongs to one of the {regions[0]:,} regions, whose "
                 f"labels are {_numbers(everywhere)}"
             )
         if bare:
             _warn(
-                f"{WHAT}: {regions[1]:,} of {regions[0]:,} regions in {len(views)} views have no caption and "
+                f"{LABEL}: {regions[1]:,} of {regions[0]:,} regions in {len(views)} views have no caption and "
                 f"{'count as something else' if self._rest else 'no feature'}; their labels are {_numbers(bare)}"
             )
         unused = {label for captions in self._captions.values() for label in captions} - everywhere
         # Objects of a scene may be hidden in all views; a file of captions was written for its masks.
         if unused and self._source != OBJECTS:
-            _warn(f"{WHAT}: {self._source}: {len(unused)} labels occur in no mask: {_numbers(unused)}")
+            _warn(f"{LABEL}: {self._source}: {len(unused)} labels occur in no mask: {_numbers(unused)}")
         return used
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
@@ -381,7 +381,7 @@ class PicturedRegions:
         """Looks at the masks of all views once, where they are at hand, and warns of regions of less than `min_area`
         pixels."""
         if views.images is None:
-            raise MissingInput(f"{WHAT}: the scene has no pictures to make vectors of regions from")
+            raise MissingInput(f"{LABEL}: the scene has no pictures to make vectors of regions from")
         self._masks, self._vectors, self._min_area = masks, vectors, min_area
         self.space = vectors.space
         if masks.cheap:
@@ -392,11 +392,11 @@ class PicturedRegions:
         small = int((sizes < self._min_area).sum())
         where = f"regions in {len(views)} views have less than {self._min_area} pixels"
         if not len(sizes):
-            raise InputError(f"{WHAT}: the masks of all {len(views)} views are empty: they have no label above 0")
+            raise InputError(f"{LABEL}: the masks of all {len(views)} views are empty: they have no label above 0")
         if small == len(sizes):
-            raise InputError(f"{WHAT}: all {small:,} {where} (teacher.min_area)")
+            raise InputError(f"{LABEL}: all {small:,} {where} (teacher.min_area)")
         if small:
-            _warn(f"{WHAT}: {small:,} of {len(sizes):,} {where} and no feature (teacher.min_area)")
+            _warn(f"{LABEL}: {small:,} of {len(sizes):,} {where} and no feature (teacher.min_area)")
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         """Codes at the resolution of the picture, into the vectors of the view's regions."""
@@ -443,7 +443,7 @@ class MapVectors:
         bad = np.flatnonzero(~np.isfinite(means).all(axis=1))
         if bad.size:
             raise InputError(
-                f"{WHAT}: view {views.names[view]!r}: {bad.size} of {len(regions)} regions have no finite "
+                f"{LABEL}: view {views.names[view]!r}: {bad.size} of {len(regions)} regions have no finite "
                 f"vector, first label {regions[bad[0]]}; check the model, and how pictures are given to it"
             )
         return means
@@ -523,7 +523,7 @@ class CropVectors:
         length = float(np.sqrt((vector * vector).sum()))
         if not 1e-12 < length < np.inf:
             raise InputError(
-                f"{WHAT}: view {view!r}, label {label}: the vector of {self.tower.name} is not finite or has no "
+                f"{LABEL}: view {view!r}, label {label}: the vector of {self.tower.name} is not finite or has no "
                 "length; check the model, and how pictures are given to it"
             )
         return (vector / length).astype(np.float32)
@@ -560,7 +560,7 @@ class OnnxImageTower:
 
     def __init__(self, path: Path, options: OnnxRegionOptions) -> None:
         """Reads the model's signature, and runs it once to see how many channels it gives."""
-        self._network = network = OnnxNetwork(path, options, WHAT)
+        self._network = network = OnnxNetwork(path, options, LABEL)
         self._side = network.fixed[1] if network.fixed else options.size or DEFAULT_SIDE
         self.name, self.digest = network.name, network.digest
         self.gray = _gray([value * options.scale for value in options.mean])
@@ -589,7 +589,7 @@ class TransformersImageTower:
 
     def __init__(self, folder: Path, device: Device) -> None:
         """Loads model and preprocessing; nothing is fetched from anywhere."""
-        loaded = read_config(folder, WHAT)
+        loaded = read_config(folder, LABEL)
         import transformers
 
         kind = loaded.model_type.removesuffix("_vision_model")
@@ -601,9 +601,9 @@ class TransformersImageTower:
             options = {"config": loaded.vision_config}
         else:
             options = {}
-        model = load_pretrained(getattr(transformers, loader), folder, WHAT, ignored=ignored, **options)
+        model = load_pretrained(getattr(transformers, loader), folder, LABEL, ignored=ignored, **options)
         with quiet_transformers():
-            self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
+            self._processor = load_companion(transformers.AutoImageProcessor, folder, LABEL, "preprocessing")
         self._uncut = _without_cropping(self._processor)
         self._device = choose_device(device)
         self._model = model.to(self._device)
@@ -617,19 +617,19 @@ class TransformersImageTower:
         with quiet_transformers():
             inputs = self._processor(images=Image.fromarray(picture), return_tensors="pt", **self._uncut)
         try:
-            with torch.inference_mode(), enough_memory(WHAT, "the size of the model"):
+            with torch.inference_mode(), enough_memory(LABEL, "the size of the model"):
                 outputs = self._model(**{name: value.to(self._device) for name, value in inputs.items()})
         except (RuntimeError, ValueError) as error:
             message = " ".join(str(error).split())[:160]
             raise InputError(
-                f"{WHAT}: {self.name} does not run on what its preprocessing makes of a picture: {message}; expected "
+                f"{LABEL}: {self.name} does not run on what its preprocessing makes of a picture: {message}; expected "
                 "config.json and preprocessor_config.json of one model"
             ) from error
         pooled = getattr(outputs, self._output, None)
         if pooled is None:
             raise InputError(
-                f"{WHAT}: {self.name}: a {self._model.config.model_type} model has no pooled output; give CLIP, SigLIP "
-                "or another model with one, or vector=map for a dense one"
+                f"{LABEL}: {self.name}: a {self._model.config.model_type} model has no pooled output; give CLIP, "
+                "SigLIP or another model with one, or vector=map for a dense one"
             )
         return np.asarray(pooled[0].flatten().float().cpu())
 
@@ -638,7 +638,7 @@ def is_joint(model: str) -> bool:
     """Whether the configuration of a folder says that it is the image side of a joint model."""
     if not model or model.lower().endswith(".onnx"):
         return False
-    loaded = read_config(find_file(model, "teacher.model", folder=True), WHAT)
+    loaded = read_config(find_file(model, "teacher.model", folder=True), LABEL)
     kind: str = loaded.model_type.removesuffix("_vision_model")
     return kind in JOINT_IMAGE
 

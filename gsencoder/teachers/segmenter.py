@@ -45,7 +45,7 @@ from gsencoder.teachers.pictures import (
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
-WHAT = "teacher segmenter"
+LABEL = "teacher segmenter"
 MULTIPLE = 32
 """Sides of pictures are multiples of this, where a model does not have a size of its own."""
 MAX_CLASSES_BYTES = 1 << 22
@@ -114,7 +114,7 @@ class OnnxSegmenter:
     """An .onnx file that gives scores of classes on a grid; `classes` are the names in the .json of the same name."""
 
     def __init__(self, path: Path, options: OnnxSegmenterOptions) -> None:
-        self._network = network = OnnxNetwork(path, options, WHAT)
+        self._network = network = OnnxNetwork(path, options, LABEL)
         self.name, self.digest, self._size = network.name, network.digest, options.size
         names = path.with_suffix(".json")
         self.classes = read_classes(names) if names.is_file() else ()
@@ -155,17 +155,17 @@ class TransformersSegmenter:
 
     def __init__(self, folder: Path, device: Device) -> None:
         """Loads model and preprocessing; nothing is fetched from anywhere."""
-        config = read_config(folder, WHAT)
+        config = read_config(folder, LABEL)
         import transformers
 
         self._kind = config.model_type
         universal = self._kind in MASK_HEADS
         loader = "AutoModelForUniversalSegmentation" if universal else "AutoModelForSemanticSegmentation"
-        model = load_pretrained(getattr(transformers, loader), folder, WHAT)
+        model = load_pretrained(getattr(transformers, loader), folder, LABEL)
         if self._kind == "oneformer":
             self._processor = _oneformer_processor(folder, config.task_seq_len)
         else:
-            self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
+            self._processor = load_companion(transformers.AutoImageProcessor, folder, LABEL, "preprocessing")
         self._device = choose_device(device)
         self._model = model.to(self._device)
         self.name = folder.resolve().name
@@ -204,8 +204,8 @@ def _oneformer_processor(folder: Path, task_tokens: int) -> Any:
     """
     from transformers import AutoImageProcessor, OneFormerProcessor
 
-    images = load_companion(AutoImageProcessor, folder, WHAT, "preprocessing", class_info_file=None)
-    return OneFormerProcessor(images, load_tokenizer(folder, WHAT), task_seq_length=task_tokens)
+    images = load_companion(AutoImageProcessor, folder, LABEL, "preprocessing", class_info_file=None)
+    return OneFormerProcessor(images, load_tokenizer(folder, LABEL), task_seq_length=task_tokens)
 
 
 def _semantic_map(classes: Any, masks: Any) -> Any:
@@ -255,7 +255,7 @@ class SegmenterConfig(TeacherSettings):
     def build(self, scene: Scene, words: Words | None) -> Teacher:  # noqa: ARG002
         if words is None:
             raise InputError(
-                f"{WHAT}: its classes need words: give a text tower (text=onnx text.model=FOLDER), or a text table "
+                f"{LABEL}: its classes need words: give a text tower (text=onnx text.model=FOLDER), or a text table "
                 "that has their names (teacher.words=)"
             )
         return SegmenterTeacher(self, words)
@@ -289,7 +289,7 @@ class SegmenterTeacher:
             self.names = self._network.classes
         if not self.names:
             raise InputError(
-                f"{WHAT}: {self._network.name}: no file says what its classes are called; give "
+                f"{LABEL}: {self._network.name}: no file says what its classes are called; give "
                 "teacher.classes= (a .json list, or a text file with one name a line)"
             )
         self.mean = words.mean
@@ -308,9 +308,9 @@ class SegmenterTeacher:
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         """Shares of the classes in the cells of one picture."""
-        image = photograph(views, view, WHAT)
+        image = photograph(views, view, LABEL)
         scores, are_probabilities, grid_from_image = self._network.scores(image, len(self.names))
-        where = f"{WHAT}: {self._network.name}: view {views.names[view]!r}"
+        where = f"{LABEL}: {self._network.name}: view {views.names[view]!r}"
         if scores.shape[-1] != len(self.names):
             raise InputError(
                 f"{where}: the network gives {scores.shape[-1]} classes, and there are {len(self.names)} names for "
@@ -345,8 +345,8 @@ def _class_vectors(synonyms: Sequence[Sequence[str]], words: Words) -> Float32[n
     side's mean, as the labels teacher has it for "other"."""
     phrases = list(dict.fromkeys(phrase for each in synonyms for phrase in each))
     if not phrases:
-        raise InputError(f"{WHAT}: none of its classes is a kind of thing; check teacher.nothing")
-    with error_prefix(f"{WHAT}: names of its classes"):
+        raise InputError(f"{LABEL}: none of its classes is a kind of thing; check teacher.nothing")
+    with error_prefix(f"{LABEL}: names of its classes"):
         vector_of = dict(zip(phrases, words.encode(phrases).astype(np.float64), strict=True))
     mean = words.mean.astype(np.float64)
     table = np.stack([np.mean([vector_of[phrase] for phrase in each], axis=0) if each else mean for each in synonyms])

@@ -27,7 +27,7 @@ from gsencoder.teachers.pictures import LARGEST_SIDE, TorchTeacher, read_preproc
 from gsencoder.text.vocabulary import OpenVocabulary, Words
 from gsencoder.types import FeatureSpace, Scene
 
-WHAT = "teacher transformers"
+LABEL = "teacher transformers"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,14 +94,14 @@ class TowerInFolder:
 
 def tower_in(folder: Path) -> TowerInFolder:
     """The vision tower of a folder, by its config.json."""
-    loaded = read_config(folder, WHAT)
+    loaded = read_config(folder, LABEL)
     config: Any = loaded if loaded.model_type in KINDS else getattr(loaded, "vision_config", None)
     kind = KINDS.get(getattr(config, "model_type", ""))
     if kind is None:
         inner = f" with a {config.model_type} tower" if config is not None else ""
         hint = f"expected one of {', '.join(kind.name for kind in KINDS.values())}, or a vision-language model with one"
         hint = "give teacher=radio for it" if loaded.model_type == "radio" else hint
-        raise InputError(f"{WHAT}: {folder} holds a {loaded.model_type} model{inner}; {hint}")
+        raise InputError(f"{LABEL}: {folder} holds a {loaded.model_type} model{inner}; {hint}")
     if loaded.model_type == "clip":
         # The width of the joint space stands in both configurations, and in old files only in this one.
         config.projection_dim = loaded.projection_dim
@@ -176,7 +176,7 @@ class TransformersConfig(TeacherSettings):
 class TransformersTeacher(TorchTeacher):
     """A vision tower on whole pictures, which are resized to multiples of the patch, without a crop."""
 
-    subject = WHAT
+    subject = LABEL
 
     def __init__(self, config: TransformersConfig, *, text_encoder: str = "") -> None:
         """Loads tower and preprocessing; nothing is fetched from anywhere."""
@@ -184,14 +184,14 @@ class TransformersTeacher(TorchTeacher):
             raise InputError("teacher.model= is missing: the folder of a vision model")
         folder = find_file(config.model, "teacher.model", folder=True)
         tower = tower_in(folder)
-        self.preprocessing = read_preprocessing(folder, WHAT, floats=tower.kind.resizes_floats)
+        self.preprocessing = read_preprocessing(folder, LABEL, floats=tower.kind.resizes_floats)
         self.device, self.config = choose_device(config.device).type, config
         self.network: VisionTower = VisionTower(folder, tower, config.dense, config.layer).to(self.device)
         network = self.network
         self.size = config.size or network.native
         if tower.kind.native_only and config.large == "interpolate" and self.size > network.native:
             raise InputError(
-                f"{WHAT}: size: {tower.kind.name} takes pictures of up to {network.native} pixels, got {self.size}; "
+                f"{LABEL}: size: {tower.kind.name} takes pictures of up to {network.native} pixels, got {self.size}; "
                 "give large=windows for larger ones"
             )
         how = f"{self.preprocessing.describe()}, resized to {self.size} px in multiples of {network.patch}"
@@ -256,19 +256,19 @@ class VisionTower(nn.Module):
         layers = int(config.num_hidden_layers)
         if layer is not None and not -layers - 1 <= layer <= layers:
             raise InputError(
-                f"{WHAT}: layer: expected {-layers - 1} to {layers}, as this {self._kind.name} tower has {layers} "
+                f"{LABEL}: layer: expected {-layers - 1} to {layers}, as this {self._kind.name} tower has {layers} "
                 f"layers, got {layer}"
             )
         import transformers  # Slow, and not needed by other teachers.
 
         if tower.cut_out:
             loader = getattr(transformers, self._kind.loader)
-            self._model, files = load_component(loader, config, folder, self._kind.weight, WHAT)
+            self._model, files = load_component(loader, config, folder, self._kind.weight, LABEL)
         else:
             projects = "WithProjection" if self._head == "projection" else ""
             loader = getattr(transformers, self._kind.loader + projects)
             ignored = () if tower.alone else ANY
-            self._model = load_pretrained(loader, folder, WHAT, ignored=ignored, config=config)
+            self._model = load_pretrained(loader, folder, LABEL, ignored=ignored, config=config)
             files = sorted(folder.glob("*.safetensors"))
         self.digest = digest_files(folder / "config.json", *files)
         self.patch = _side(config.patch_size)
@@ -288,7 +288,7 @@ class VisionTower(nn.Module):
         if self._kind.joint == "head":
             return "head" if tower.config.vision_use_head else ""
         if self._kind.joint == "projection":
-            has = not tower.alone or "visual_projection.weight" in weight_names(folder, WHAT)
+            has = not tower.alone or "visual_projection.weight" in weight_names(folder, LABEL)
             return "projection" if has else ""
         return ""
 
@@ -297,7 +297,7 @@ class VisionTower(nn.Module):
             return "tokens"
         if not self._head:
             raise InputError(
-                f"{WHAT}: dense={dense} needs a head that maps to the space of a text tower, and this "
+                f"{LABEL}: dense={dense} needs a head that maps to the space of a text tower, and this "
                 f"{self._kind.name} tower has none; give dense=tokens"
             )
         if dense == "auto":

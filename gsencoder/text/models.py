@@ -249,7 +249,7 @@ def _read_json(path: Path, kind: type = dict) -> Any:
     return value
 
 
-WHAT = "text tower"
+LABEL = "text tower"
 TOKENIZER_FILES = ("tokenizer*.json", "vocab*", "merges.txt", "*.model", "special_tokens_map.json")
 
 
@@ -303,7 +303,7 @@ class TransformersTower:
         if not config.model:
             raise InputError("text.model= is missing: the folder of a text tower")
         folder = find_file(config.model, "text.model", folder=True)
-        model_config = read_config(folder, WHAT)
+        model_config = read_config(folder, LABEL)
         import torch
         import transformers
 
@@ -316,13 +316,13 @@ class TransformersTower:
         text = getattr(model_config, "text_config", model_config)
         self._longest = int(getattr(text, "max_position_embeddings", 0) or 0)
         # What looks like a special token in a phrase is text.
-        self._tokenizer = load_tokenizer(folder, WHAT, split_special_tokens=True)
+        self._tokenizer = load_tokenizer(folder, LABEL, split_special_tokens=True)
         loader = getattr(transformers, self._kind.loader if self._kind else "AutoModel")
-        model = load_pretrained(loader, folder, WHAT, ignored=ANY if self._kind else ())
+        model = load_pretrained(loader, folder, LABEL, ignored=ANY if self._kind else ())
         rows = model.get_input_embeddings().num_embeddings
         if len(self._tokenizer) > rows:
             raise InputError(
-                f"{WHAT}: {folder}: the tokenizer has {len(self._tokenizer)} tokens and the model {rows}; expected "
+                f"{LABEL}: {folder}: the tokenizer has {len(self._tokenizer)} tokens and the model {rows}; expected "
                 "both of one model"
             )
         self._device = choose_device(config.device)
@@ -371,7 +371,7 @@ def _choose_pooling(folder: Path, model_type: str, requested: str) -> str:
     pooling = "output" if model_type in JOINT else declared_pooling(folder)
     if not pooling:
         raise InputError(
-            f"{WHAT}: {folder}: no file says how token vectors of a {model_type} model become one "
+            f"{LABEL}: {folder}: no file says how token vectors of a {model_type} model become one "
             "(1_Pooling/config.json); give text.pooling=mean, cls or eos as the model's card says"
         )
     return pooling

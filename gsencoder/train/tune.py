@@ -30,8 +30,8 @@ from gsencoder.data.prompts import PromptStore, StoredPrompt
 from gsencoder.train.distributed import check_agreement
 from gsencoder.train.loop import Trainer, TrainerConfig, TrainingState
 from gsencoder.train.vlm import (
+    LABEL,
     SPLIT,
-    WHAT,
     AdapterConfig,
     TokenHook,
     TowerLayout,
@@ -398,10 +398,10 @@ def open_tuned(folder: Path, model: Path, *, with_tokens: bool = False) -> Tuned
 
     _, processor, layout = open_processor(model, with_tokens=with_tokens)
     if not (folder / "adapter_model.safetensors").is_file():
-        raise InputError(f"{WHAT}: {folder} has no adapter_model.safetensors; expected what tune wrote")
+        raise InputError(f"{LABEL}: {folder} has no adapter_model.safetensors; expected what tune wrote")
     for name in ("adapter_model.safetensors", "adapter_config.json"):
         warn_if_modified(folder / name)
-    base = load_pretrained(AutoModelForImageTextToText, model.resolve(), WHAT)
+    base = load_pretrained(AutoModelForImageTextToText, model.resolve(), LABEL)
     with quiet_peft():
         adapted = peft.PeftModel.from_pretrained(base, str(folder), use_safetensors=True)
     path = folder / PROJECTION_FILE

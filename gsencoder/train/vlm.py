@@ -36,7 +36,7 @@ from gsencoder.core.pretrained import (
 )
 from gsencoder.core.settings import CheckedConfig, option
 
-WHAT = "tune"
+LABEL = "tune"
 SERVED_FOLDER = "served"
 
 
@@ -55,7 +55,7 @@ def check_peft() -> None:
     try:
         import peft  # noqa: F401
     except ImportError as error:
-        raise InputError(f"{WHAT}: needs the package peft (pip install 'gsencoder[tune]')") from error
+        raise InputError(f"{LABEL}: needs the package peft (pip install 'gsencoder[tune]')") from error
 
 
 @contextmanager
@@ -68,25 +68,25 @@ def quiet_peft() -> Iterator[None]:
 
 def load_processor(folder: Path) -> tuple[Any, Any]:
     """Configuration and processor of a vision-language model, without its weights."""
-    config = read_config(folder, WHAT)
+    config = read_config(folder, LABEL)
     from transformers import AutoProcessor
     from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
 
     if type(config) not in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING or not hasattr(config, "vision_config"):
         raise InputError(
-            f"{WHAT}: {folder}: a model of the kind {config.model_type} takes no pictures with its text; expected a "
+            f"{LABEL}: {folder}: a model of the kind {config.model_type} takes no pictures with its text; expected a "
             "vision-language model, such as SmolVLM, LLaVA or Qwen2-VL"
         )
-    weight_files(folder, WHAT)
-    processor = load_companion(AutoProcessor, folder, WHAT, "processor")
+    weight_files(folder, LABEL)
+    processor = load_companion(AutoProcessor, folder, LABEL, "processor")
     if getattr(processor, "image_processor", None) is None or getattr(processor, "tokenizer", None) is None:
         raise InputError(
-            f"{WHAT}: {folder}: has no processor of pictures and text; expected processor_config.json or "
+            f"{LABEL}: {folder}: has no processor of pictures and text; expected processor_config.json or "
             "preprocessor_config.json, and a tokenizer, beside the model"
         )
     if not getattr(processor, "chat_template", None):
         raise InputError(
-            f"{WHAT}: {folder}: its processor has no chat template, by which `ask` and servers put pictures and "
+            f"{LABEL}: {folder}: its processor has no chat template, by which `ask` and servers put pictures and "
             "questions together; expected chat_template.jinja beside the model"
         )
     asked = [{"role": "user", "content": [{"type": "image"}, {"type": "text", "text": "question"}]}]
@@ -95,7 +95,7 @@ def load_processor(folder: Path) -> tuple[Any, Any]:
     except Exception as error:  # templates raise whatever they like
         message = " ".join(str(error).split())[:160]
         raise InputError(
-            f"{WHAT}: {folder}: its chat template cannot be used: {message}; expected that of the model, in "
+            f"{LABEL}: {folder}: its chat template cannot be used: {message}; expected that of the model, in "
             "chat_template.jinja"
         ) from error
     return config, processor
@@ -103,7 +103,7 @@ def load_processor(folder: Path) -> tuple[Any, Any]:
 
 def model_digest(folder: Path) -> str:
     """A fingerprint of a model's configuration and weights."""
-    return digest_files(folder / "config.json", *weight_files(folder, WHAT))
+    return digest_files(folder / "config.json", *weight_files(folder, LABEL))
 
 
 def load_adapted(
@@ -116,7 +116,7 @@ def load_adapted(
     from transformers import AutoModelForImageTextToText
 
     # Its path is written into the adapters.
-    model = load_pretrained(AutoModelForImageTextToText, folder.resolve(), WHAT)
+    model = load_pretrained(AutoModelForImageTextToText, folder.resolve(), LABEL)
     model.to(getattr(torch, base))
     tower, head = model.get_encoder("image"), model.get_output_embeddings()
     in_tower = set(tower.modules()) if tower is not model else set()

@@ -10,7 +10,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.memory import bank as bank_module
 from gsencoder.memory import reduction
 from gsencoder.memory.bank import BankConfig, MapStream, build_bank, draw_sample, raw_features
-from gsencoder.memory.reduction import CoverReduction, reduce_as_published, unit_rows
+from gsencoder.memory.reduction import CoverReduction, reduce_algorithm1, unit_rows
 from gsencoder.types import FeatureMap, FeatureSpace, MemoryBank
 
 SPACE = FeatureSpace(name="s", channels=16)
@@ -77,7 +77,7 @@ def test_the_published_bank_states_the_share_that_it_covers() -> None:
     rows = all_rows(maps)
     mean = rows.mean(axis=0)
     bank = build_bank(stream(maps), SPACE, mean, BankConfig(method="paper", threshold=0.85, drop_last=100))
-    expected, _ = reduce_as_published(unit_rows(rows - mean), 0.85, drop_last=100)
+    expected, _ = reduce_algorithm1(unit_rows(rows - mean), 0.85, drop_last=100)
     np.testing.assert_allclose(bank.components, rows[expected], rtol=1e-5, atol=1e-6)
     best = cosines(rows, bank.components, mean).max(axis=1)
     assert bank.coverage == pytest.approx((best >= 0.85).mean())
@@ -274,7 +274,7 @@ def cover_of(features: np.ndarray, threshold: float) -> np.ndarray:
 
 
 def published(features: np.ndarray, threshold: float) -> np.ndarray:
-    return reduce_as_published(unit_rows(features), threshold)[0]
+    return reduce_algorithm1(unit_rows(features), threshold)[0]
 
 
 def transcription(features: np.ndarray, threshold: float, chunk: int, *, drop_last: bool) -> tuple[list, np.ndarray]:
@@ -301,7 +301,7 @@ def test_the_published_algorithm_gives_what_its_transcription_gives(rng, monkeyp
     monkeypatch.setattr(reduction, "PRODUCT_VALUES", 30_000)
     features = redundant_rows(rng, 1070)
     components, used = transcription(features, threshold, 100, drop_last=drop_last)
-    rows, in_use = reduce_as_published(unit_rows(features), threshold, drop_last=100 if drop_last else 0)
+    rows, in_use = reduce_algorithm1(unit_rows(features), threshold, drop_last=100 if drop_last else 0)
     assert 5 <= len(components) < 1000
     assert rows.tolist() == components
     np.testing.assert_array_equal(in_use, used)
