@@ -116,8 +116,9 @@ def write_safetensors(path: Path, arrays: Mapping[str, np.ndarray], metadata: Ma
     """Writes the bytes of `safetensors.numpy.save`, without a second copy of the arrays in memory. The library's
     `save_file` writes a file of a random name first, which a kill leaves in the folder for good."""
     entries = entries_of(arrays)
+    header = safetensors_header(entries, metadata)
     with atomic_file(path) as stream:
-        stream.write(safetensors_header(entries, metadata))
+        stream.write(header)
         for name in _file_order(entries):
             stream.write(bytes_of(arrays[name]).data)
 
