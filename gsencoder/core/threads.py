@@ -144,21 +144,18 @@ def parallel(work: Callable[[int], Result], pieces: Iterable[int]) -> list[Resul
         for thread in others:
             thread.start()
         run()
-        _join(others)
+        for thread in others:
+            thread.join()
     except BaseException:
         # Interrupted between two pieces, or while it waits: nothing goes on when this returns.
         deque(following, maxlen=0)
-        _join(others)
+        for thread in others:
+            if thread.ident is not None:
+                thread.join()
         raise
     if errors:
         raise errors[min(errors)]
     return [results[number] for number in range(len(waiting))]
-
-
-def _join(threads: Iterable[threading.Thread]) -> None:
-    for thread in threads:
-        if thread.ident is not None:
-            thread.join()
 
 
 @contextlib.contextmanager

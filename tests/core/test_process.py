@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -288,7 +288,7 @@ def test_of_several_errors_the_one_of_the_first_piece_is_raised_and_no_more_piec
 def test_where_the_caller_is_interrupted_no_more_pieces_begin_and_none_runs_on(two_threads, monkeypatch):
     working, waited_for = threading.Event(), threading.Event()
     begun, ended = list[int](), list[int]()
-    one_thread, join = threads._one_thread, threads._join
+    one_thread, join = threads._one_thread, threading.Thread.join
 
     @contextmanager
     def interrupted() -> Iterator[None]:
@@ -298,9 +298,9 @@ def test_where_the_caller_is_interrupted_no_more_pieces_begin_and_none_runs_on(t
         with one_thread():
             yield
 
-    def joined(others: Iterable[threading.Thread]) -> None:
+    def joined(thread: threading.Thread) -> None:
         waited_for.set()
-        join(others)
+        join(thread)
 
     def work(piece: int) -> None:
         begun.append(piece)
@@ -309,7 +309,7 @@ def test_where_the_caller_is_interrupted_no_more_pieces_begin_and_none_runs_on(t
         ended.append(piece)
 
     monkeypatch.setattr(threads, "_one_thread", interrupted)
-    monkeypatch.setattr(threads, "_join", joined)
+    monkeypatch.setattr(threading.Thread, "join", joined)
     with pytest.raises(KeyboardInterrupt):
         parallel(work, range(9))
     assert begun == ended == [0]
