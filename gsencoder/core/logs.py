@@ -64,7 +64,11 @@ LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
 
 
 class Log:
-    """Writes a row of numbers for each step. The file is closed after every row, so that a kill loses none."""
+    """Writes a row of numbers for each step. The file is closed after every row, so that a kill loses none.
+
+    Attributes:
+        before: the rows of earlier runs that it goes on from, as text.
+    """
 
     def __init__(self, folder: Path, *, done: int, events: bool, begun: bool = False) -> None:
         """Removes the rows of steps after `done`, which will be repeated; a row holds the number of steps that were
@@ -81,10 +85,10 @@ class Log:
         try:
             if begun and not self.path.is_file():
                 warnings.warn(f"{self.path}: is missing; the log starts at step {done}", SceneWarning, stacklevel=2)
-            before = read_log(self.path) if self.path.is_file() else []
-            rows = [row for row in before if int(row["step"]) <= done]
-            self._columns = list(dict.fromkeys(name for row in rows for name in row))
-            self._rewrite(rows)
+            rows = read_log(self.path) if self.path.is_file() else []
+            self.before = [row for row in rows if int(row["step"]) <= done]
+            self._columns = list(dict.fromkeys(name for row in self.before for name in row))
+            self._rewrite(self.before)
         except InputError:
             raise
         except (OSError, ValueError, KeyError, csv.Error) as error:

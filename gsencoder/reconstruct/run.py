@@ -19,7 +19,7 @@ from torch import Tensor
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.budget import reject_options_set_by_budget
 from gsencoder.core.device import choose_device
-from gsencoder.core.errors import InputError, SceneWarning, error_hint
+from gsencoder.core.errors import InputError, SceneWarning, error_hint, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import Clock, Device, Track, defer_signals, untracked
 from gsencoder.core.settings import check_limits, first_difference, option
@@ -51,11 +51,13 @@ from gsencoder.reconstruct.score import (
     compare,
     describe_exposure,
     predict_exposures,
-    split,
 )
+from gsencoder.render.images import inner
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Gaussians, Scene
 
+MIN_PHOTOGRAPHS = 2
+"""Smallest number of photographs that a splat can be fitted to."""
 CHECKPOINT_FILE = "reconstruction.safetensors"
 IMAGE_SCALE = "image_scale"
 """The setting that says by which factor a budget made the photographs smaller."""
@@ -186,6 +188,37 @@ def load_state(path: Path, settings: Mapping[str, Any], *, sh_degree: int, devic
             exposures = torch.from_numpy(file.array("exposure.maps", "float32", ("V", 3, 4)).copy())
     adam = RowAdam.restored(tables, adam_steps)
     return State(adam=adam, anchor=anchor, exposures=exposures, step=step, seconds=seconds, facts=facts)
+
+
+def split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
+    """Row numbers of the views to fit, and of every n-th view, which is held out; those of which a mask leaves no
+    window of pixels are in neither.
+
+    Warns:
+        SceneWarning: some are masked all over; they are named.
+    """
+    count = len(photographs.names)
+    held_out = [view for view in range(count) if every and view % every == 0]
+    training = [view for view in range(count) if view not in held_out]
+    if len(training) < MIN_PHOTOGRAPHS:
+        raise InputError(
+            f"reconstruct: expected at least {MIN_PHOTOGRAPHS} photographs to fit, got {len(training)} of {count}; "
+            "give more photographs" + (f", or hold out fewer than every {every}th (holdout=)" if every else "")
+        )
+    masked = {view for view, mask in enumerate(photographs.masks) if mask is not None and not inner(mask).any()}
+    for views, subject, least in (
+        (training, "photographs to fit", MIN_PHOTOGRAPHS),
+        (held_out, "held-out photographs", 0),
+    ):
+        names = [photographs.names[view] for view in views if view in masked]
+        message = f"{len(names)} of {len(views)} {subject} are masked all over"
+        if names and len(views) - len(names) < least:
+            raise InputError(
+                f"reconstruct: {message}: {listed(names)}; look at their masks, or at their alpha channels"
+            )
+        if names:
+            warnings.warn(f"{message} and not used: {listed(names)}", SceneWarning, stacklevel=2)
+    return [view for view in training if view not in masked], [view for view in held_out if view not in masked]
 
 
 class Start(NamedTuple):
@@ -367,6 +400,7 @@ def reconstruct(
     """
     if scene.views is None:
         raise InputError(f"reconstruct: scene {scene.name} has no photographs to fit a splat to")
+    identity = {**made_from, **config.identity()}
     budget, began, target = config.budget, now() - spent, choose_device(device)
     with ExitStack() as stack:
         folder = work or Path(stack.enter_context(TemporaryDirectory()))
@@ -378,8 +412,8 @@ def reconstruct(
         clock = Clock()
         with clock("read"):
             photographs = Photographs(scene.views, track=in_time)
+            identity["photographs"] = photographs.digest()
         training, held_out = split(photographs, config.holdout)
-        identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
         with clock("seeds"):
             if continued:
                 state = load_state(checkpoint, identity, sh_degree=config.optimize.sh_degree, device=target)
@@ -415,7 +449,8 @@ def reconstruct(
             apply_plan(optimizer, plan)
         for line in (description, *plan.notes):
             report(line)
-        start, facts = now() - state.seconds, {**state.facts, PLAN: asdict(plan)}
+        seeding = {name: value for name, value in state.facts.items() if name != PLAN}
+        start, facts = now() - state.seconds, {**seeding, PLAN: asdict(plan)}
 
         def save() -> None:
             color_maps = None if optimizer.exposures is None or not optimizer.step else optimizer.exposures.maps
@@ -457,7 +492,7 @@ def reconstruct(
         comparisons = compare(optimizer, held_out, matched=differing is not None and source == "mean")
         return Reconstruction(
             gaussians=gaussians,
-            seeding={name: value for name, value in state.facts.items() if name != PLAN},
+            seeding=seeding,
             steps=optimizer.step,
             training=optimizer.training,
             held_out=tuple(held_out),

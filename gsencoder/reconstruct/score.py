@@ -1,7 +1,6 @@
 """Scores of a splat on held-out photographs: over all pixels, and over the ones that a fitted photograph shows, in the
 exposures that the fitted ones let expect."""
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,8 @@ from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from torch import Tensor
 
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.errors import InputError, SceneWarning, error_hint, listed
-from gsencoder.core.logs import LOG_FILE, Log, read_log
+from gsencoder.core.errors import InputError, error_hint
+from gsencoder.core.logs import Log
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.stereo import confirms, sample_depth, world_points
 from gsencoder.reconstruct.optimize import SAME, Exposures, Optimizer
@@ -22,8 +21,6 @@ from gsencoder.render.images import IDENTITY, inner, psnr, ssim
 from gsencoder.types import Cameras
 from gsencoder.types.orientation import turned
 
-MIN_PHOTOGRAPHS = 2
-"""Smallest number of photographs that a splat can be fitted to."""
 SAME_DEPTH = 0.02
 """Relative difference of measured depths up to which two photographs show the same surface."""
 
@@ -152,37 +149,6 @@ class Score(NamedTuple):
     floating: float | None = None
 
 
-def split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
-    """Row numbers of the views to fit, and of every n-th view, which is held out; those of which a mask leaves no
-    window of pixels are in neither.
-
-    Warns:
-        SceneWarning: some are masked all over; they are named.
-    """
-    count = len(photographs.names)
-    held_out = [view for view in range(count) if every and view % every == 0]
-    training = [view for view in range(count) if view not in held_out]
-    if len(training) < MIN_PHOTOGRAPHS:
-        raise InputError(
-            f"reconstruct: expected at least {MIN_PHOTOGRAPHS} photographs to fit, got {len(training)} of {count}; "
-            "give more photographs" + (f", or hold out fewer than every {every}th (holdout=)" if every else "")
-        )
-    masked = {view for view, mask in enumerate(photographs.masks) if mask is not None and not inner(mask).any()}
-    for views, subject, least in (
-        (training, "photographs to fit", MIN_PHOTOGRAPHS),
-        (held_out, "held-out photographs", 0),
-    ):
-        names = [photographs.names[view] for view in views if view in masked]
-        message = f"{len(names)} of {len(views)} {subject} are masked all over"
-        if names and len(views) - len(names) < least:
-            raise InputError(
-                f"reconstruct: {message}: {listed(names)}; look at their masks, or at their alpha channels"
-            )
-        if names:
-            warnings.warn(f"{message} and not used: {listed(names)}", SceneWarning, stacklevel=2)
-    return [view for view in training if view not in masked], [view for view in held_out if view not in masked]
-
-
 def covisible_pixels(
     photographs: Photographs, views: Sequence[int], training: Sequence[int]
 ) -> dict[int, Bool[Tensor, "H W"]]:
@@ -195,21 +161,21 @@ def covisible_pixels(
         photographs: of all views; views without measured depth are left out of the result.
         training: the photographs that a splat is fitted to.
     """
-    depths, points, visible = {}, {}, {}
+    known, points, visible = {}, {}, {}
     for view in views:
         photo = photographs.at_scale(view)
         if photo.depth is not None:
-            depths[view] = photo.depth
-            points[view] = world_points(photo.depth, photo, _pose(photographs, view))[photo.depth > 0]
-            visible[view] = torch.zeros(len(points[view]), dtype=torch.bool)
+            known[view] = photo.depth > 0
+            points[view] = world_points(photo.depth, photo, _pose(photographs, view))[known[view]]
+            visible[view] = torch.zeros_like(known[view])
     # One fitted photograph after the other, so that not all of them are held at once.
     for other in training if points else ():
         photo = photographs.at_scale(other)
         for view, positions in points.items():
             if photo.depth is not None:
                 z, measured = sample_depth(positions, photo.depth, photo, _pose(photographs, other))
-                visible[view] |= confirms(z, measured, SAME_DEPTH)
-    return {view: (depth > 0).masked_scatter(depth > 0, visible[view]) for view, depth in depths.items()}
+                visible[view][known[view]] |= confirms(z, measured, SAME_DEPTH)
+    return visible
 
 
 def _pose(photographs: Photographs, view: int) -> Float[Tensor, "4 4"]:
@@ -338,10 +304,11 @@ class Validation:
         with error_hint(START_AGAIN):
             self._log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
             try:
-                rows = read_log(work / LOG_FILE)
-                self.rows: list[LogRow] = [{name: float(cell) for name, cell in row.items()} for row in rows]
+                self.rows: list[LogRow] = [
+                    {name: float(cell) for name, cell in row.items()} for row in self._log.before
+                ]
             except ValueError as error:
-                raise InputError(f"{work / LOG_FILE}: damaged: {error}") from error
+                raise InputError(f"{self._log.path}: damaged: {error}") from error
         self._optimizer, self._held_out, self._report = optimizer, held_out, report
         self._seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
 

@@ -24,7 +24,7 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.splats.files import load_splat
 from gsencoder.reconstruct import run as reconstruct
 from gsencoder.reconstruct import score as scores
-from gsencoder.reconstruct.score import split
+from gsencoder.reconstruct.run import split
 from gsencoder.types import Views
 
 pytestmark = pytest.mark.slow
