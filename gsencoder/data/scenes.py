@@ -365,15 +365,16 @@ def make_views(
         if image.depth_camera is not None:
             check_camera(image.depth_camera, f"{where}: depth")
     grids, depth_grids, transparent, orientations = pixel_grids(images, pinholes, image_scale, posed.source)
+    partial = have_empty_pixels(grids)
+    Ks = np.array([grid.K for grid in grids])
     cameras = Cameras(
         cam_from_world=move_origin(cam_from_world, origin).astype(np.float32),
-        Ks=np.array([grid.pinhole.matrix(grid.width, grid.height) for grid in grids]).astype(np.float32),
+        Ks=Ks.astype(np.float32),
         widths=np.array([grid.width for grid in grids], np.int32),
         heights=np.array([grid.height for grid in grids], np.int32),
     )
     masks = [image.mask for image in images]
     instances = [image.instance for image in images]
-    partial = have_empty_pixels(grids)
     background = None
     # A fisheye picture may be a disc in a black frame.
     is_plain = not (any(masks) or any(transparent) or any("FISHEYE" in image.camera.model for image in images))

@@ -235,6 +235,11 @@ class PixelGrid:
     turn: int = 1
 
     @property
+    def K(self) -> Float64[np.ndarray, "3 3"]:
+        """Intrinsics of the view."""
+        return self.pinhole.matrix(self.width, self.height)
+
+    @property
     def reduction(self) -> int:
         """How many times smaller a photograph is decoded: 1, 2, 4 or 8."""
         source = self.source
@@ -484,7 +489,7 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
         if image.depth_from_color is None:
             depth = self._nearest(view, values) * image.depth_scale
             if image.depth_measure == "ray":
-                depth /= ray_lengths(grid.pinhole.matrix(grid.width, grid.height), grid.width, grid.height)
+                depth /= ray_lengths(grid.K, grid.width, grid.height)
         else:
             depth = self._registered(view, values * image.depth_scale, image)
         if depth.size and depth.max() > np.finfo(np.float32).max:
@@ -507,7 +512,7 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
             depth.astype(np.float32),
             K,
             invert_rigid(image.depth_from_color),
-            grid.pinhole.matrix(grid.width, grid.height),
+            grid.K,
             grid.width,
             grid.height,
         )

@@ -134,7 +134,7 @@ def read_transforms(
         if image is None:
             missing["image"].append(name)
             continue
-        world_from_cam = pose_in(frame, "transform_matrix", where) @ OPENCV_FROM_OPENGL
+        cam_from_world = invert_rigid(pose_in(frame, "transform_matrix", where) @ OPENCV_FROM_OPENGL)
         files: dict[str, Path | None] = dict.fromkeys(FILES_OF_FRAME)
         for kind, (keys, *_) in FILES_OF_FRAME.items():
             key = next((key for key in keys if frame.get(key) is not None), None)
@@ -152,7 +152,7 @@ def read_transforms(
             PosedImage(
                 name=name,
                 camera=_camera(data, frame, image, where),
-                cam_from_world=invert_rigid(world_from_cam),
+                cam_from_world=cam_from_world,
                 image=image,
                 mask=files["mask"],
                 instance=files["instance"],

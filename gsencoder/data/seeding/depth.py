@@ -15,6 +15,7 @@ images, the walls' and the floor's in most rooms (a Manhattan world, Coughlan an
 """
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
 from typing import NamedTuple, no_type_check
@@ -26,7 +27,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning, error_prefix
 from gsencoder.core.threads import ahead, kernel
 from gsencoder.data.seeding.points import flat_gaussians
-from gsencoder.types import Gaussians, Views
+from gsencoder.types import Cameras, Gaussians, Views
 from gsencoder.types.scene import invert_rigid, pixel_centers, transform, unproject_points
 
 AXIS_BITS = 19  # Bits of a voxel index along one axis: 524,288 voxels, or 10 km at 2 cm
@@ -419,7 +420,7 @@ def room_frame(views: Views) -> Float64[np.ndarray, "4 4"] | None:
     A grid of cubes is the same whichever axis comes first and whichever way it points. Each is the one nearest to the
     world's, so that rows that are sorted by cells come in the world's order.
     """
-    normals = _normals(views) if views.depths is not None and len(views) else np.empty((0, 3))
+    normals = np.empty((0, 3)) if views.depths is None else _normals(views.cameras, views.depths)
     if not len(normals):
         return None
     poses, center = views.cameras.cam_from_world.astype(np.float64), views.cameras.centers.mean(axis=0)
@@ -431,21 +432,20 @@ def room_frame(views: Views) -> Float64[np.ndarray, "4 4"] | None:
     return frame
 
 
-def _normals(views: Views) -> Float64[np.ndarray, "n 3"]:
+def _normals(cameras: Cameras, depths: Sequence[Float32[np.ndarray, "_ _"]]) -> Float64[np.ndarray, "n 3"]:
     """Unit normals in the world of the surfaces that some depth images show."""
-    assert views.depths is not None
     parts = [np.empty((0, 3))]
-    for view in even_indices(len(views), FRAME_VIEWS):
-        depth = views.depths[int(view)]
+    for view in even_indices(len(depths), FRAME_VIEWS):
+        depth = depths[int(view)]
         step = -(-max(depth.shape) // FRAME_SIDE)
-        K = views.cameras.Ks[view] / np.array([[step], [step], [1]], np.float32)
+        K = cameras.Ks[view] / np.array([[step], [step], [1]], np.float32)
         # Depth that cannot be is refused where all of it is read.
         with np.errstate(all="ignore"):
             pixels = surface_pixels(np.ascontiguousarray(depth[::step, ::step]), K)
         local = pixels.normals[pixels.use].astype(np.float64)
         local = local[np.isfinite(local).all(axis=1)]
         local = local[even_indices(len(local), FRAME_NORMALS)] if len(local) else local
-        parts.append(local @ views.cameras.cam_from_world[view, :3, :3])
+        parts.append(local @ cameras.cam_from_world[view, :3, :3])
     return np.concatenate(parts)
 
 
