@@ -176,7 +176,8 @@ class Run:
 
     def to_dict(self) -> dict[str, Any]:
         """The record as JSON values. `non_finite` lists the results that were not finite and are null."""
-        total, versions = time.perf_counter() - self.began, _versions()
+        seconds = {**self.timings, "total": time.perf_counter() - self.began}
+        timings, versions = {name: round(value, 4) for name, value in seconds.items()}, _versions()
         peak, processors = peak_memory_mb(), available_cores()
         lost: list[str] = []
         results = plain(self.results, "results", lost)
@@ -184,7 +185,7 @@ class Run:
             "command": self.command,
             "version": gsencoder.__version__,
             "settings": plain(self.settings, "settings", lost),
-            "timings": {name: round(seconds, 4) for name, seconds in (*self.timings.items(), ("total", total))},
+            "timings": timings,
             "peak_memory_mb": round(peak, 1),
             "warnings": list(self.warnings),
             "results": results,

@@ -71,7 +71,7 @@ def score_views(
     def one(view: int) -> list[_TargetInView]:
         b = blend(gaussians, small, view, config=config)
         # Pixels that each Gaussian fills.
-        weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians))
+        weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(b.depths))
         return [each.seen(b, weights, small, view, config) for each in probes]
 
     # Small views are rendered faster with one thread for each view than with all threads for one.
@@ -108,7 +108,7 @@ class _TargetProbe:
     def __init__(self, gaussians: Gaussians, target: Target) -> None:
         self._rows = target.rows
         self._alone = gaussians.select(target.rows)
-        member = np.zeros(len(gaussians), np.float32)
+        member = np.zeros_like(gaussians.opacities)
         member[target.rows] = 1
         self._member = torch.from_numpy(member)
         near = np.linalg.norm(gaussians.means - target.center, axis=1) <= CONSTANTS.context_radii * target.radius
