@@ -126,15 +126,16 @@ class Run:
         self._scene: tuple[str, Path, Run] | None = None
 
     def add_warning(self, text: str) -> str:
-        """Adds a warning; the command line adds every `SceneWarning` of the run. Returns it as the run shows it: with
-        the name of the scene, if there are several and it names none."""
+        """Adds a warning as one line; the command line adds every `SceneWarning` of the run. Returns it as the run
+        shows it: with the name of the scene, if there are several and it names none."""
+        text = one_line(text)
         if self._scene is not None:
             name, path, of_scene = self._scene
             of_scene.warnings.append(text)
             if not text.startswith(f"{name}: ") and str(path) not in text:
                 text = f"{name}: {text}"
         self.warnings.append(text)
-        return text
+        return one_line(text)
 
     @contextmanager
     def warning_lines(self, debug: bool) -> Iterator[None]:
@@ -149,7 +150,7 @@ class Run:
                 if not issubclass(category, SceneWarning):
                     usual(message, category, filename, lineno, file, line)
                     return
-                text = one_line(self.add_warning(one_line(str(message))))
+                text = self.add_warning(str(message))
                 print(f"warning: {text}" + (f" ({filename}:{lineno})" if debug else ""), file=sys.stderr)
 
             warnings.showwarning = show
@@ -205,7 +206,7 @@ class Run:
 
     def report_up(self, scene: str, up: Up | None) -> None:
         """Records which way is up in a scene; an estimate is printed."""
-        self.results["up"] = None if up is None else up.to_dict()
+        self.results["up"] = up
         if up is not None and up.source != "files":
             self.print(f"up of {scene}: {up.describe()} (data.up= states it)")
 

@@ -11,7 +11,6 @@ orientation of its Gaussians hardly: there planes through neighboring means say 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -49,10 +48,10 @@ class Up:
     """An estimated direction."""
 
     direction: Float64[np.ndarray, "3"]  # unit vector in the world
+    source: str  # files, cameras, surfaces, or cameras and surfaces
     # From 0 to 1: the share of the surfaces that lie or stand under it, above what a random direction would have; of
     # cameras alone, how level they stand.
     confidence: float
-    source: str  # files, cameras, surfaces, or cameras and surfaces
 
     def describe(self) -> str:
         """The direction and how it is known, for people."""
@@ -60,10 +59,6 @@ class Up:
         if self.source == "files":
             return f"({direction}), of the files"
         return f"({direction}), estimated from {self.source}, confidence {self.confidence:.2f}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """The direction and how it is known, as JSON values."""
-        return {"direction": self.direction.tolist(), "source": self.source, "confidence": self.confidence}
 
 
 def up_of_cameras(cameras: Cameras) -> Float64[np.ndarray, "3"]:

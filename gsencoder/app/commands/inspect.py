@@ -208,7 +208,7 @@ def scene_facts(scene: Scene, posed: PosedImages, layout: str, up: Up | None) ->
         "objects": len(scene.objects),
         "instances": _instances_source(views),
         "metres_per_unit": scene.metres_per_unit,
-        "up": None if up is None else up.to_dict(),
+        "up": up,
         "missing": _missing(scene, views, up),
         "unused": [*posed.unused, *unused],
         "field_of_view": fields,
