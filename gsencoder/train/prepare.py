@@ -184,12 +184,13 @@ def dataset_space(
         mean = teacher.mean if teacher.mean is not None else mean
     space = spaces[0]
     use_basis = fusion.wants_basis(space)
-    table = basis = codebook = None
+    coordinates = basis = None
     if tables:
         table = np.unique(np.concatenate(tables), axis=0)
         mean = table.mean(axis=0) if mean is None else mean
         variance = np.square(table - mean, dtype=np.float64).sum(axis=1).mean()
         basis = table_basis(table, mean, space, energy=fusion.table_energy) if use_basis else None
+        coordinates = table if basis is None else to_coordinates(basis, table)
     else:
         moments, kinds = Moments(space.channels), dict[str, None]()
         maps = sampled_maps(scenes, open_scene, config.basis_views, optional=optional)
@@ -221,8 +222,7 @@ def dataset_space(
         centered=config.center,
         scaled=config.scale,
     )
-    if table is not None:
-        codebook = outputs.standardize(table if basis is None else to_coordinates(basis, table))
+    codebook = None if coordinates is None else outputs.standardize(coordinates)
     return outputs, codebook, tuple(kinds)
 
 

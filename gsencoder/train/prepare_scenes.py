@@ -267,13 +267,14 @@ def _preparation_settings(
     training: Sequence[Path], words: Words | None, teacher: TeacherConfig, config: SourceConfig, voxel: float
 ) -> dict[str, Any]:
     """Everything that the preparation for a teacher depends on, as JSON values."""
-    words_digest = _words_digest(words)
+    of_teacher = plain(teacher)
     # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.
-    of_teacher = {name: value for name, value in plain(teacher).items() if name != "heads"}
+    of_teacher.pop("heads", None)
     return {
-        "scenes": dict.fromkeys((path.name for path in training), TRAINED),
-        "words": words_digest,
-        **{name: plain(getattr(config, name)) for name in ("data", "seeds")},
+        "scenes": dict.fromkeys([path.name for path in training], TRAINED),
+        "words": _words_digest(words),
+        "data": plain(config.data),
+        "seeds": plain(config.seeds),
         "teacher": of_teacher,
         "prepare": plain(config.prepare),
         **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras, "voxel": voxel},

@@ -278,11 +278,6 @@ class PreparedScene:
         return "int8" if self._scales else "float16"
 
     @property
-    def channels(self) -> int:
-        """Columns of the targets."""
-        return self._arrays.shape("targets")[1]
-
-    @property
     def means(self) -> Float32[np.ndarray, "N 3"]:
         return self._arrays.array("means")
 

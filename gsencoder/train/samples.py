@@ -511,7 +511,7 @@ def _targets_of(
 ) -> TeacherTargets:
     """The targets of one teacher for the remaining Gaussians, and its rows in the views."""
     balance = teacher.class_balance
-    rows = [empty_rows(scene.channels)]
+    rows = [empty_rows(teacher.channels)]
     for view in views if losses.render_weight and teacher.weight else ():
         view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
         rows.append(make_render_rows(view_rows, balance, losses.rarity))

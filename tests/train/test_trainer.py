@@ -97,7 +97,7 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
         data[number]  # Kinds of targets are looked up once, and here before they are spoiled.
     one = encoder_trainer(small_encoder(), data, LOSSES, SHORT, folder=tmp_path, settings={})
     before = {name: value.clone() for name, value in one.network.state_dict().items()}
-    spoiled = lambda scene, rows: np.full((len(rows), scene.channels), np.inf, np.float16)  # noqa: E731
+    spoiled = lambda scene, rows: np.full(scene.targets(rows).shape, np.inf, np.float16)  # noqa: E731
     monkeypatch.setattr(PreparedScene, "float16_targets", spoiled)
     with pytest.raises(
         InputError, match=r"the field loss of wall_\d \((near, far|far, near)\) is not finite at step 0"
