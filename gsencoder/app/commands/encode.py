@@ -163,7 +163,7 @@ def _encode_into(
         by_teacher, encoding = {name: by_teacher[name] for name in teachers}, config.encode
     if config.basis_views and all(each.basis is None for each in by_teacher.values()):
         raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
-    single = len(by_teacher) == 1
+    single, spaces = len(by_teacher) == 1, [features.space for features in by_teacher.values()]
     figures = {
         name: {
             "channels": features.space.channels,
@@ -195,7 +195,7 @@ def _encode_into(
         **made_with,
         **(next(iter(figures.values())) if single else {"teachers": figures}),
     )
-    return [features.space for features in by_teacher.values()], lines
+    return spaces, lines
 
 
 def requested_teachers(encoder: Encoder, names: tuple[str, ...]) -> list[str]:
