@@ -267,18 +267,18 @@ def _preparation_settings(
     training: Sequence[Path], words: Words | None, teacher: TeacherConfig, config: SourceConfig, voxel: float
 ) -> dict[str, Any]:
     """Everything that the preparation for a teacher depends on, as JSON values."""
-    of_teacher = plain(teacher)
-    # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.
-    of_teacher.pop("heads", None)
-    return {
+    settings = {
         "scenes": dict.fromkeys([path.name for path in training], TRAINED),
         "words": _words_digest(words),
         "data": plain(config.data),
         "seeds": plain(config.seeds),
-        "teacher": of_teacher,
+        "teacher": plain(teacher),
         "prepare": plain(config.prepare),
         **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras, "voxel": voxel},
     }
+    # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.
+    settings["teacher"].pop("heads", None)
+    return settings
 
 
 def _prepare_scene(
