@@ -78,7 +78,8 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, ru
     with run.resumable(out, "reconstruction", resume=config.resume) as (folder, work):
         opened = _open(path, work, config, config.data, spent, run)
         scale = _affordable_scale(opened, work, config, spent=spent())
-        opened = _at_scale(opened, scale, path, work, config, run)
+        if scale != 1:
+            opened = _at_scale(opened, scale, path, work, config, run)
         run.add_seconds(opened.seconds)
         with run.step("check"):
             warn_of_faults(opened.scene)
@@ -129,10 +130,12 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, ru
             splat=PLY_FILE,
             log=LOG_FILE,
         )
-        seconds = result.elapsed + time.perf_counter() - ended
-        # A scene without poses of its own has the name of the folder of its state.
-        name = opened.scene.name if opened.sfm is None else path.name
-        lines = _report_budget(name, scale, result, folder / PLY_FILE, seconds, config, run)
+        lines: list[str] = []
+        if config.budget.limits:
+            seconds = result.elapsed + time.perf_counter() - ended
+            # A scene without poses of its own has the name of the folder of its state.
+            name = opened.scene.name if opened.sfm is None else path.name
+            lines = _report_budget(name, scale, result, folder / PLY_FILE, seconds, config, run)
     run.print(*(f"{out}: {line}" for line in lines))
     scores = f"; {describe(last)} on {counted(len(result.held_out), 'held-out photograph')}" if last else ""
     run.print(f"{out / PLY_FILE}: {counted(len(result.gaussians), 'Gaussian')}{scores}")
@@ -169,10 +172,8 @@ def _report_budget(
     config: ReconstructCommandConfig,
     run: Run,
 ) -> list[str]:
-    """What limits chose and what became of them; nothing where there are none."""
+    """Reports what limits chose; returns a line for each limit that is kept."""
     budget, plan = config.budget, result.plan
-    if not budget.limits:
-        return []
     image_scale = scale * config.data.image_scale
     chosen = {"image_scale": image_scale, "steps": result.steps, "sh_degree": plan.sh_degree}
     options = [f"data.image_scale={image_scale!r}", f"optimize.steps={plan.steps}"]
@@ -204,8 +205,7 @@ def _at_scale(
 ) -> OpenedScene:
     """The scene with photographs that are larger by a factor."""
     views = opened.scene.views
-    if scale == 1 or views is None:
-        return opened
+    assert views is not None
     data = replace(config.data, image_scale=scale)
     with warnings.catch_warnings():
         # They were printed when the scene was read at its full size.
