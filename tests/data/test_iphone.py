@@ -122,6 +122,13 @@ def test_frames_without_a_pose_or_depth_are_counted(room, tmp_path):
     assert "1 of 4 frames are not in pose_intrinsic_imu.json and are left out (first: 'frame_000000.jpg')" in messages
     assert "1 of 4 frames lost tracking" in messages
     assert "1 of 2 depth files are missing (first: 'frame_000020.jpg')" in messages
+    path.write_text("{}")
+    with pytest.raises(InputError, match="no view: of 4 pictures 4 are not in pose_intrinsic_imu.json"):
+        load_scene(iphone)
+    for picture in (iphone / "rgb").iterdir():
+        picture.unlink()
+    with pytest.raises(InputError, match="no view: of 0 pictures none has a picture"):
+        load_scene(iphone)
 
 
 @pytest.mark.parametrize("broken", ["[]", '{"frame_000000": 3}', '{"frame_000000": {"aligned_pose": [[1]]}}'])

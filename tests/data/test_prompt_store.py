@@ -21,6 +21,8 @@ def test_what_is_written_is_read(tmp_path):
     assert store.picture(prompt.pictures[0]).shape == (48, 64, 3)
     assert not np.array_equal(*(store.picture(name) for name in prompt.pictures))
     np.testing.assert_array_equal(store.tokens(prompt.tokens), tokens)
+    # People can read it too.
+    assert "Grün" in (tmp_path / PROMPTS_FILE).read_text("utf-8")
 
 
 def test_a_changed_picture_is_refused(tmp_path):

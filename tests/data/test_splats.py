@@ -9,6 +9,7 @@ import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import imagecodecs
 import numpy as np
@@ -17,6 +18,7 @@ import splat_samples as samples
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats import files as splats
+from gsencoder.data.splats import ply
 from gsencoder.data.splats.files import fingerprint, load_splat, read_raw, save_splat
 from gsencoder.data.splats.repair import inspect_splat
 
@@ -26,7 +28,7 @@ SPZ = {"quats": 2e-3, "log_scales": 0.03126, "opacities": 0.00197, "dc": 0.01308
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_an_inria_ply_comes_back_exactly_but_for_logarithms(tmp_path, degree):
-    gaussians = samples.make_gaussians(5000, degree)
+    gaussians = samples.make_gaussians(9000, degree)
     save_splat(tmp_path / "a.ply", gaussians)
     loaded = load_splat(tmp_path / "a.ply")
     assert np.array_equal(loaded.means, gaussians.means)
@@ -380,6 +382,21 @@ def test_a_full_disk_or_a_kill_in_mid_write_leaves_the_old_file(tmp_path, monkey
         save_splat(tmp_path / "a.spz", gaussians)
     assert os.listdir(tmp_path) == ["a.spz"]
     assert (tmp_path / "a.spz").read_bytes() == before
+
+
+def test_a_ply_that_is_cut_off_while_it_is_read_is_refused_with_the_row(tmp_path, monkeypatch):
+    save_splat(tmp_path / "a.ply", samples.make_gaussians(9000, 0))
+    row_bytes = ply.inria_row_bytes(0, double_means=False)
+    start_of = ply.element_start
+
+    def cut_after_check(*args: Any) -> int:
+        start = start_of(*args)
+        os.truncate(tmp_path / "a.ply", start + 5000 * row_bytes + 7)
+        return start
+
+    monkeypatch.setattr(ply, "element_start", cut_after_check)
+    with pytest.raises(InputError, match="ended while it was read, at row 5,000 of 9,000"):
+        read_raw(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.splat"])
