@@ -1,6 +1,7 @@
 """Validation on prepared scenes, with an encoder that knows, and with ones that do not."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ from training_scenes import prepared, small_encoder
 from gsencoder.evaluate import validation
 from gsencoder.evaluate.validation import ClassAccuracy, nearest_classes, validate_encoder, validate_names
 from gsencoder.infer.encode import EncodeConfig
-from gsencoder.models.output_space import OutputSpaces
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
+from gsencoder.train.prepared import PreparedScene
 from gsencoder.train.samples import TrainingScene
-from gsencoder.types import GaussianFeatures
+from gsencoder.types import FeatureSpace, GaussianFeatures
 
 
 def test_choices_are_those_that_occur_in_the_scene() -> None:
@@ -61,6 +63,40 @@ def test_who_always_says_the_same_is_right_about_one_kind_and_who_says_the_oppos
     opposite = judged(walls, monkeypatch, lambda targets: -targets)
     assert opposite.cosine_named == pytest.approx(-1, abs=1e-5)
     assert opposite.score < 0.2
+
+
+def test_counts_and_the_cosine_are_those_of_the_definition(rng, monkeypatch):
+    mean = rng.normal(size=4).astype(np.float32)
+    space = OutputSpace(space=FeatureSpace(name="s", channels=4), mean=mean, scale=3.0)
+    codebook = rng.normal(size=(6, 4)).astype(np.float32)
+    accuracy, correct, total, cosines = ClassAccuracy(space, codebook), np.zeros(6), np.zeros(6), []
+    for classes in ([0, 1, 2], [2, 3, 4]):
+        targets = (codebook[rng.choice(classes, 300)] * rng.uniform(0.2, 1.5, (300, 1))).astype(np.float32)
+        predicted = targets + rng.normal(size=(300, 4)).astype(np.float32)
+        weights = np.where(np.arange(300) % 7 == 3, 0, rng.uniform(1, 2, 300))
+        # Exactly half the root mean square distance from the mean; and a prediction that is the mean.
+        targets[:2] = [0, 0, 1, 0], [3, 0, 0, 0]
+        predicted[1] = 0
+        monkeypatch.setattr(PreparedScene, "weights", weights)
+        monkeypatch.setattr(PreparedScene, "targets", lambda _, rows, targets=targets: targets[rows])
+        accuracy.add(PreparedScene(Path("a")), space.restore(predicted))
+        seen = weights > 0
+        to_targets, to_predicted = (
+            np.square(x[seen, None] - codebook).sum(axis=2, dtype=np.float64) for x in (targets, predicted)
+        )
+        true = to_targets.argmin(axis=1)
+        absent = np.setdiff1d(np.arange(6), true)
+        to_predicted[:, absent] = np.inf
+        np.add.at(total, true, 1)
+        np.add.at(correct, true, to_predicted.argmin(axis=1) == true)
+        for target, guess in zip(targets[seen], predicted[seen], strict=True):
+            if np.sqrt(np.square(target).sum()) >= 1:
+                cosines.append(target @ guess / max(np.linalg.norm(target) * np.linalg.norm(guess), 1e-12))
+    assert accuracy.scenes == 2
+    np.testing.assert_array_equal(accuracy.total, total)
+    np.testing.assert_array_equal(accuracy.correct, correct)
+    assert 0 < correct.sum() < total.sum()
+    assert accuracy.cosine_named == pytest.approx(np.mean(cosines), abs=1e-5)
 
 
 @pytest.mark.slow

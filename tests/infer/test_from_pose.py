@@ -5,7 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from feature_fields import plain_features
-from posed_words import CHANNELS, NAMES, SPACE, ball_scene, memory_of, plain_relevancy, scene_of, two_kinds, words
+from posed_words import (
+    CHANNELS,
+    NAMES,
+    SPACE,
+    ball_scene,
+    memory_of,
+    opaque_ball,
+    plain_relevancy,
+    scene_of,
+    two_kinds,
+    words,
+)
 from scipy.spatial.transform import Rotation
 from splats import front_camera, one_gaussian, random_rotation
 
@@ -39,6 +50,16 @@ def test_maps_of_relevancy_are_the_plain_definition_and_nan_where_there_is_no_su
     assert np.array_equal(np.isnan(maps), plain == -2)
     assert 0 < np.isnan(maps).sum() < maps.size
     np.testing.assert_allclose(maps[plain > -2], plain[plain > -2], atol=5e-6)
+
+
+def test_relevancy_is_from_minus_1_to_1_also_where_a_cosine_is_rounded_beyond() -> None:
+    text = words()
+    direction = text.encode(NAMES[:1]) - text.mean
+    for sign in (1, -1):
+        features = plain_features(np.repeat(text.mean + sign * direction, 60, axis=0), SPACE, mean=text.mean)
+        maps = FeatureField(scene_of(opaque_ball(60), features)).at(front_camera()).relevancy(NAMES[:1], text)
+        assert np.nanmax(sign * maps) == 1
+        assert np.nanmin(sign * maps) > 1 - 1e-5
 
 
 def test_depth_and_position_agree_with_the_camera_and_with_the_gaussians_of_the_pixel() -> None:
