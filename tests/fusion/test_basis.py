@@ -36,6 +36,21 @@ def test_streaming_moments_equal_those_of_all_vectors_at_once(rng: np.random.Gen
     np.testing.assert_allclose(moments.covariance(), np.cov(x.T.astype(np.float64), bias=True), atol=1e-3)
 
 
+@pytest.mark.parametrize("second", [True, False])
+def test_moments_of_scenes_that_are_merged_are_those_of_all_vectors(rng: np.random.Generator, second: bool) -> None:
+    scenes = [low_rank(rng, n=count, noise=0.3, mean=mean) for count, mean in ((40, 5.0), (150, -3.0), (90, 1.0))]
+    merged = Moments(24, second=second)
+    for vectors in (scenes[0][:0], *scenes, scenes[0][:0]):
+        part = Moments(24, second=second)
+        part.add(vectors)
+        merged.merge(part)
+    x = np.concatenate(scenes)
+    assert merged.count == len(x)
+    np.testing.assert_allclose(merged.mean, x.mean(axis=0, dtype=np.float64), atol=1e-5)
+    if second:
+        np.testing.assert_allclose(merged.covariance(), np.cov(x.T.astype(np.float64), bias=True), atol=1e-3)
+
+
 def test_a_mean_a_million_times_the_spread_does_not_swallow_it(rng: np.random.Generator) -> None:
     x = (rng.normal(size=(400, 24)) * 1e-2 + 1e4).astype(np.float32)
     np.testing.assert_allclose(np.diag(moments_of(x, 3).covariance()), x.astype(np.float64).var(axis=0), rtol=1e-2)
@@ -152,6 +167,30 @@ def test_figures_are_those_of_a_direct_computation(rng: np.random.Generator) -> 
     assert fit.cosine == pytest.approx(cosines.mean(), abs=1e-4)
     assert fit.worst == pytest.approx(np.quantile(cosines, 0.05), abs=2e-3)
     assert fit.vectors == len(others)
+
+
+def test_vectors_that_are_the_mean_are_left_out_and_short_ones_count_as_any(rng: np.random.Generator) -> None:
+    basis, others = basis_of(vectors_of(rng), 4), vectors_of(rng, 200)
+    plain, near = ProjectionSums(), ProjectionSums()
+    plain.add(basis, others)
+    near.add(basis, np.concatenate([basis.mean + (others - basis.mean) / 128, np.tile(basis.mean, (3, 1))]))
+    expected, actual = plain.fit(), near.fit()
+    assert actual.vectors == 200
+    assert (actual.energy, actual.cosine, actual.worst) == pytest.approx(
+        (expected.energy, expected.cosine, expected.worst), abs=1e-4
+    )
+
+
+def test_no_projection_counts_for_longer_than_its_vector(rng: np.random.Generator) -> None:
+    basis = basis_of(vectors_of(rng), 12)
+    for vector in vectors_of(rng, 50):
+        sums = ProjectionSums()
+        sums.add(basis, vector[None])
+        fit = sums.fit()
+        assert 1 - 1e-6 < fit.cosine <= 1
+        assert 1 - 1e-6 < fit.energy <= 1
+        # Quantiles are interpolated in the last of a thousand bins.
+        assert fit.worst == pytest.approx(0.99905)
 
 
 def test_coded_and_dense_maps_of_the_same_vectors_give_the_same_figures() -> None:

@@ -81,6 +81,16 @@ def test_blocks_of_queries_give_what_all_at_once_give(monkeypatch: pytest.Monkey
     monkeypatch.setattr(memory_types, "BLOCK_SCORES", 70 * 13)
     with torch.no_grad():
         torch.testing.assert_close(module(queries), whole)
+        sizes, attend = list[int](), module._attend
+        monkeypatch.setattr(module, "_attend", lambda part: sizes.append(len(part)) or attend(part))
+        module(queries)
+        assert sum(sizes) == len(queries) > max(sizes) == 13
+        # One query at a time where a block is smaller than the bank.
+        monkeypatch.setattr(attention_module, "BLOCK_SCORES", 9)
+        sizes.clear()
+        module(queries)
+        assert sizes == [1] * len(queries)
+        monkeypatch.setattr(attention_module, "BLOCK_SCORES", 70 * 13)
     queries.requires_grad_()
     (in_blocks := module(queries)).square().sum().backward()
     torch.testing.assert_close(in_blocks.detach(), whole)
@@ -147,6 +157,8 @@ def test_other_values_than_the_components_are_averaged_with_the_same_weights() -
     np.testing.assert_allclose(memory.attend(queries, values), expected, rtol=1e-4, atol=1e-5)
     module = module_of(memory, values=torch.from_numpy(values))
     np.testing.assert_allclose(module(torch.from_numpy(queries)).detach().numpy(), expected, rtol=1e-3, atol=1e-4)
+    # Keys and values come from the bank: a checkpoint holds what is trained.
+    assert list(module.state_dict()) == ["projection"]
 
 
 def test_a_bank_that_was_made_without_centering_is_compared_about_the_mean_of_the_space() -> None:
@@ -195,10 +207,14 @@ def test_a_memory_whose_parts_do_not_fit_is_refused(no_jaxtyping: None) -> None:
         {"grid_from_image": -memory.bank.grid_from_image},
         {"grid_from_image": memory.bank.grid_from_image[:, :, [1, 0, 2]]},
         {"grid_from_image": memory.bank.grid_from_image * np.nan},
-        {"threshold": 0.0},
-        {"coverage": 1.1},
+        *({"threshold": value} for value in (0.0, 1.1)),
+        *({"coverage": value} for value in (-0.1, 1.1, np.nan)),
+        *({"cosine": value} for value in (-1.1, 1.1, np.nan)),
         {"space": FeatureSpace(name="s", channels=23)},
     ]
     for changes in changed:
         with pytest.raises(InputError, match=r"MemoryBank\."):
             replace(memory.bank, **changes)
+    # The ends of the ranges are allowed.
+    replace(memory.bank, coverage=0.0, cosine=-1.0)
+    replace(memory.bank, coverage=1.0, cosine=1.0, threshold=1.0)

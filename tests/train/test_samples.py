@@ -179,6 +179,27 @@ def test_where_all_weights_are_1_samples_are_the_same_without_looking_up_classes
         assert same(sample._replace(teachers=()), looked_up._replace(teachers=()))
 
 
+@pytest.mark.parametrize(
+    ("sampling", "losses", "teacher", "used"),
+    [
+        ({}, {}, {}, False),
+        ({"rare_centers": 0.1, "gaussians": 1}, {}, {}, True),
+        ({"rare_centers": 0.1, "gaussians": 0}, {}, {}, False),
+        ({}, {"rarity": 0.1}, {"classes": False}, True),
+        ({}, {"contrast_weight": 0.1}, {"weight": 0.1}, True),
+        ({}, {"contrast_weight": 0.1}, {"classes": False}, False),
+        ({}, {"contrast_weight": 0.1}, {"weight": 0.0}, False),
+    ],
+)
+def test_classes_are_looked_up_for_each_use_by_itself(dataset, sampling, losses, teacher, used):
+    recipe = samples(
+        *dataset,
+        sampling=SamplingConfig(**({"gaussians": 200, "rare_centers": 0.0} | sampling)),
+        losses=LossConfig(**({"rarity": 0.0, "contrast_weight": 0.0} | losses)),
+    ).recipe
+    assert recipe.uses_classes(replace(recipe.teachers[0], **teacher)) == used
+
+
 def test_all_kinds_are_equally_often_the_center_of_a_sample(dataset, monkeypatch):
     recipe, drawn = samples(*dataset).recipe, list[np.ndarray]()
 
