@@ -55,6 +55,9 @@ def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alo
         torch.testing.assert_close(predicted.grad.split(widths, dim=1)[number], part.grad)
     half = Distillation(small_encoder(8), LOSSES, joint(datasets, {"heights": 0.25}).recipe.teachers).lambdas
     assert half == {name: weight * (0.25 if "heights" in name else 1) for name, weight in both.lambdas.items()}
+    first, second = data.recipe.teachers
+    without_classes = Distillation(small_encoder(8), LOSSES, (first, replace(second, classes=False))).lambdas
+    assert without_classes == {name: weight for name, weight in both.lambdas.items() if name != "heights/contrast"}
 
 
 def test_samples_have_the_targets_of_each_teacher_for_the_same_gaussians(datasets: Datasets) -> None:
