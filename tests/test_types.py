@@ -1,5 +1,6 @@
 """What the types that pass between stages do beside holding arrays."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,12 @@ def test_resized_cameras_keep_their_field_of_view(width, height, longest):
 def test_a_scene_has_a_positive_unit_or_none(unit, no_jaxtyping):
     with pytest.raises(InputError, match=r"Scene\.metres_per_unit: expected a positive number of metres"):
         Scene(name="room", metres_per_unit=unit)
+
+
+@pytest.mark.parametrize("means", [None, [[0.0, 0, 0]], np.zeros((), np.float32), np.zeros(3, np.float32)])
+def test_means_that_are_no_rows_are_refused(means, no_jaxtyping):
+    with pytest.raises(InputError, match=r"Gaussians\.means: expected"):
+        replace(random_gaussians(1), means=means)
 
 
 def test_views_need_a_name_and_an_entry_for_each_camera(no_jaxtyping):
