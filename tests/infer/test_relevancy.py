@@ -93,14 +93,24 @@ def test_chunks_do_not_change_scores(rng: np.random.Generator, monkeypatch: pyte
     np.testing.assert_allclose(relevancy(features, text, mean), whole, atol=1e-7)
 
 
-def test_contrast_is_the_smallest_pairwise_softmax(rng: np.random.Generator) -> None:
-    features, text, negatives, mean = in_basis(rng), words(rng), words(rng, 4), np.zeros(24, np.float32)
+@pytest.mark.parametrize("basis", [True, False])
+def test_contrast_is_the_smallest_pairwise_softmax(rng: np.random.Generator, basis: bool) -> None:
+    # Without a mean each rival is the strongest somewhere.
+    features = in_basis(rng) if basis else plain_features(rng.normal(size=(300, 24)), SPACE)
+    text, negatives, mean = words(rng), words(rng, 4), np.zeros(24, np.float32)
     scores = relevancy(features, text, mean, negatives=negatives, mode="raw", temperature=0.1)
     cosines = plain_cosine(features.decode(), np.concatenate([text, negatives]))
     for row in range(3):
         rivals = [other for other in range(7) if other != row]
         pairs = [np.exp(10 * cosines[row]) / (np.exp(10 * cosines[row]) + np.exp(10 * cosines[k])) for k in rivals]
         np.testing.assert_allclose(scores[row, features.seen], np.min(pairs, axis=0)[features.seen], atol=1e-5)
+        assert basis or len(np.unique(np.argmin(pairs, axis=0))) == len(rivals)
+
+
+def test_relevancy_is_from_minus_1_to_1_also_where_a_cosine_is_rounded_beyond(rng: np.random.Generator) -> None:
+    text, mean = words(rng, 200), np.zeros(24, np.float32)
+    scores = relevancy(plain_features(np.concatenate([text, -text]), SPACE), text, mean)
+    assert (scores.min(), scores.max()) == (-1, 1)
 
 
 def test_contrast_at_any_temperature_is_finite_and_a_word_is_no_rival_of_itself(rng: np.random.Generator) -> None:
