@@ -237,6 +237,8 @@ def test_a_camera_that_is_astray_does_not_make_steps_larger() -> None:
     far = replace(views, cameras=replace(views.cameras, cam_from_world=astray))
     extents = [wall_optimizer(QUICK, 0.3, some).extent for some in (views, far)]
     assert extents[1] < 2 * extents[0]
+    distances = np.linalg.norm(views.cameras.centers - np.median(views.cameras.centers, axis=0), axis=1)
+    assert extents[0] == pytest.approx(1.1 * np.quantile(distances, 0.9))
 
 
 NOTHING = PruneConfig(opacity=0.0, screen=0.0, contribution=0.0)

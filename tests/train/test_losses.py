@@ -153,3 +153,6 @@ def test_a_head_gives_standard_units_of_its_own_space() -> None:
     outputs = AdapterHead(torch.nn.Identity(), mean.float(), scale)(vectors.float())
     torch.testing.assert_close(outputs.double(), (vectors - mean) / scale * 6**0.5, rtol=1e-4, atol=1e-5)
     assert abs(outputs.square().mean() - 1) < 1e-4
+    for wrong in (0.0, -0.5, float("inf"), float("nan")):
+        with pytest.raises(InputError, match="heads: expected a positive scale"):
+            AdapterHead(torch.nn.Identity(), mean.float(), wrong)

@@ -118,6 +118,25 @@ def test_of_many_scenes_the_latest_used_are_kept_open(dataset, monkeypatch, most
         assert opened == set(list(dict.fromkeys(reversed(used)))[:most])
 
 
+def test_scenes_of_two_teachers_have_two_files_of_those_that_are_open(datasets: Datasets, monkeypatch) -> None:
+    monkeypatch.setattr("gsencoder.train.samples.MAX_OPEN_FILES", 4)
+    data = joint(datasets)
+    for number in range(9):
+        assert data[number]
+        opened = [scene for scene in data.scenes if "_arrays" in vars(scene.first)]
+        assert len(opened) == min(number + 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("render", "weights", "read"),
+    [(1.0, {}, [True, True]), (1.0, {"heights": 0.0}, [True, False]), (0.0, {}, [False, False])],
+)
+def test_rows_of_views_are_read_for_a_render_loss_alone(datasets: Datasets, render, weights, read) -> None:
+    data = joint(datasets, weights, losses=replace(LOSSES, render_weight=render))
+    sample = SampleDataset(data.scenes[:2], data.recipe)[0]
+    assert [len(each.rows.targets) > 0 for each in sample.teachers] == read
+
+
 def test_samples_of_a_step_are_of_one_size_and_steps_of_many(dataset: tuple[PreparedDataset, list[str]]) -> None:
     crops = SamplingConfig(views=1, gaussians=300, smallest=20)
     data = samples(*dataset, augmentation=None, sampling=crops, step_samples=3)
