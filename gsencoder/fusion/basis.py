@@ -138,8 +138,8 @@ def table_basis(
     wide, centered = mean.astype(np.float64), table.astype(np.float64) - mean
     if len(table) >= space.channels:
         return fit_basis(wide, centered.T @ centered / len(table), space, energy=energy)
-    # The same without a matrix of all channels, whose eigenvectors would take longer than lifting a view.
-    _, lengths, vectors = np.linalg.svd(centered / np.sqrt(len(table)), full_matrices=False)
+    # Eigenvectors of all channels would take longer than lifting a view. Only ratios of the eigenvalues matter.
+    _, lengths, vectors = np.linalg.svd(centered, full_matrices=False)
     return _leading(wide, lengths**2, vectors, space, energy=energy, max_rank=0)
 
 

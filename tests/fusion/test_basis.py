@@ -68,6 +68,12 @@ def test_the_rank_is_the_smallest_that_keeps_the_energy(rng: np.random.Generator
         assert basis.energy_kept == pytest.approx(share[basis.rank - 1], abs=1e-6)
 
 
+def test_all_of_the_energy_is_kept_without_channels_that_hold_rounding_alone(rng: np.random.Generator) -> None:
+    vectors = np.linalg.qr(rng.normal(size=(24, 24)))[0]
+    covariance = (vectors * np.r_[4, 2, 1, 0.1, 1e-6, np.full(19, 2e-8)]) @ vectors.T
+    assert fit_basis(np.zeros(24), covariance, SPACE, energy=1.0).rank == 5
+
+
 @pytest.mark.parametrize("channels", [7, 10, 24])
 def test_of_equally_strong_directions_a_share_of_the_energy_takes_that_share(channels: int) -> None:
     """The share may be off by rounding either way, as 3 · 0.1 is."""
