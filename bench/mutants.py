@@ -157,6 +157,8 @@ def test_files(project: Path, module: str) -> tuple[list[str], list[str]]:
     name, stem = "gsencoder." + module.replace("/", "."), module.rpartition("/")[2]
     folder = project / "tests" / module.partition("/")[0]
     first = [path for path in tests if path.stem == f"test_{stem}" or re.search(rf"\b{name}\b", path.read_text())]
+    # The file that is named like the module notices most.
+    first.sort(key=lambda path: path.stem != f"test_{stem}")
     rest = [path for path in tests if folder in path.parents and path not in first]
     return [str(path.relative_to(project)) for path in first], [str(path.relative_to(project)) for path in rest]
 
