@@ -405,7 +405,7 @@ def rows_to_keep(
     config: PruneConfig,
     raster: RasterConfig,
     *,
-    most: int | None = None,
+    max_gaussians: int | None = None,
 ) -> Int64[Tensor, " n"]:
     """Rows that are opaque enough, of sane size on every screen, and seen somewhere.
 
@@ -414,7 +414,7 @@ def rows_to_keep(
 
     Args:
         views: photographs that count, at any size, gone through once.
-        most: the most rows that are left, the ones that contribute most to some view; None = no limit.
+        max_gaussians: rows that are left at most, the ones that contribute most to some view; None = no limit.
 
     Raises:
         InputError: nothing would be left.
@@ -445,9 +445,9 @@ def rows_to_keep(
             f"{int(rows.sum())} by {name} {getattr(config, name):g}" for name, rows in rejected.items() if rows.any()
         )
         raise InputError(f"reconstruct: pruning would leave none of {len(means)} Gaussians ({why})")
-    if most is not None and len(rows_left) > most:
+    if max_gaussians is not None and len(rows_left) > max_gaussians:
         by_contribution = contributions[rows_left].argsort(descending=True, stable=True)
-        rows_left = rows_left[by_contribution[:most]].sort().values
+        rows_left = rows_left[by_contribution[:max_gaussians]].sort().values
     return rows_left
 
 
@@ -477,7 +477,7 @@ class Optimizer:
             settings say so or because their exposures do not differ.
         is_consistent: whether the state is that between two steps, so that it may be saved.
         extent: length that the learning rate of positions is multiplied by, world units.
-        most: number of Gaussians that pruning leaves at most; None = no limit.
+        max_gaussians: number that pruning leaves at most; None = no limit.
     """
 
     def __init__(
@@ -496,7 +496,7 @@ class Optimizer:
         """`exposures` are color maps [V, 3, 4] of a run that is continued; None = identities at step 0, later none."""
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
-        self.most: int | None = None
+        self.max_gaussians: int | None = None
         self.adam, self.anchor, self.step, self.is_consistent = adam, anchor, step, True
         fits_exposure = config.exposure and (step == 0 or exposures is not None)
         self.exposures = Exposures(self.training, exposures) if fits_exposure else None
@@ -600,7 +600,14 @@ class Optimizer:
     def contributing(self) -> Int64[Tensor, " n"]:
         """Rows that pruning would leave now."""
         views = ((view, self.photographs.at_scale(view, 2)) for view in self.training)
-        return rows_to_keep(self.parameters, self.photographs.cameras, views, self.pruning, self.raster, most=self.most)
+        return rows_to_keep(
+            self.parameters,
+            self.photographs.cameras,
+            views,
+            self.pruning,
+            self.raster,
+            max_gaussians=self.max_gaussians,
+        )
 
     def prune(self) -> None:
         """Removes the Gaussians that contribute nothing."""

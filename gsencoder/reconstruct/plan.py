@@ -183,7 +183,7 @@ class Plan:
     """What a reconstruction is about to do.
 
     Attributes:
-        most: Gaussians that pruning leaves at most; None = no limit.
+        max_gaussians: Gaussians that pruning leaves at most; None = no limit.
         spent: seconds before the first step.
         until: seconds after which no step begins; None without a limit of them.
         seconds: expected in all; None without a limit of them.
@@ -193,7 +193,7 @@ class Plan:
 
     steps: int
     sh_degree: int
-    most: int | None = None
+    max_gaussians: int | None = None
     spent: float = 0.0
     until: float | None = None
     seconds: float | None = None
@@ -257,7 +257,7 @@ def make_plan(
 def apply_plan(optimizer: Optimizer, plan: Plan) -> None:
     """Sets steps, colors and the limit of Gaussians; coefficients of colors above the planned degree are taken out."""
     optimizer.config = replace(optimizer.config, steps=plan.steps, sh_degree=plan.sh_degree)
-    optimizer.most = plan.most
+    optimizer.max_gaussians = plan.max_gaussians
     coefficients = (plan.sh_degree + 1) ** 2 - 1
     if optimizer.parameters["shN"].shape[1] > coefficients:
         # There are no moments yet.
@@ -288,11 +288,11 @@ def _within_megabytes(optimizer: Optimizer, budget: ReconstructBudget, plan: Pla
     limit = budget.limit("megabytes") * MEGABYTE - HEADER_BYTES
     sizes = {d: inria_row_bytes(d, double_means=double_means) for d in range(plan.sh_degree, -1, -1)}
     degree = next((d for d, row in sizes.items() if contributing * row <= limit), 0)
-    most = int(limit // sizes[degree])
-    if most < 1:
+    max_gaussians = int(limit // sizes[degree])
+    if max_gaussians < 1:
         raise budget.too_small((HEADER_BYTES + sizes[0]) / MEGABYTE)
-    expected = (HEADER_BYTES + min(contributing, most) * sizes[degree]) / MEGABYTE
-    return replace(plan, sh_degree=degree, most=most, megabytes=expected)
+    expected = (HEADER_BYTES + min(contributing, max_gaussians) * sizes[degree]) / MEGABYTE
+    return replace(plan, sh_degree=degree, max_gaussians=max_gaussians, megabytes=expected)
 
 
 def refuse_late(budget: ReconstructBudget, spent: float, subject: str, advice: str = "") -> None:

@@ -476,7 +476,7 @@ def reconstruct(
                     validate(now() - start)
                 optimizer.advance()
                 save_if_due()
-            if plan.most is not None and len(optimizer.parameters["means"]) > plan.most:
+            if plan.max_gaussians is not None and len(optimizer.parameters["means"]) > plan.max_gaussians:
                 # The time was over before the first pruning.
                 with defer_signals():
                     optimizer.prune()

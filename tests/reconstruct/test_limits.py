@@ -150,7 +150,7 @@ def test_a_run_that_was_cut_goes_on_by_the_clock_and_what_is_too_large_is_taken_
     result = reconstruct(scene, config, now=clock, work=tmp_path)
     # Before the first pruning.
     assert (result.steps, result.elapsed) == (3, 120)
-    assert len(result.gaussians) == result.plan.most
+    assert len(result.gaussians) == result.plan.max_gaussians
 
 
 @pytest.mark.usefixtures("no_gpu")

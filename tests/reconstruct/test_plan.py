@@ -140,15 +140,17 @@ def test_less_room_first_costs_degrees_of_color_and_then_gaussians(optimizer: Op
         for row in (164, 163, 104, 103, 68, 34)
     ]
     assert [plan.sh_degree for plan in plans] == [2, 1, 1, 0, 0, 0]
-    assert [plan.most is not None and plan.most >= contributing for plan in plans] == [True] * 5 + [False]
-    assert plans[-1].most == contributing // 2
+    assert [plan.max_gaussians is not None and plan.max_gaussians >= contributing for plan in plans] == [True] * 5 + [
+        False
+    ]
+    assert plans[-1].max_gaussians == contributing // 2
     assert {plan.spent for plan in plans} == {7.0}
     one = planned(optimizer, ReconstructBudget(megabytes=(2048 + 68.5) / 1e6))
-    assert (one.sh_degree, one.most) == (0, 1)
+    assert (one.sh_degree, one.max_gaussians) == (0, 1)
     # Positions as doubles take 12 bytes more.
     apply_plan(optimizer, Plan(steps=9, sh_degree=0))
     wide = ReconstructBudget(megabytes=(2048 + contributing * 68) / 1e6)
-    assert planned(optimizer, wide, double=True).most == (contributing * 68) // 80
+    assert planned(optimizer, wide, double=True).max_gaussians == (contributing * 68) // 80
 
 
 def test_where_nothing_contributes_yet_all_gaussians_are_to_fit(optimizer, monkeypatch):
@@ -165,23 +167,23 @@ def test_where_nothing_contributes_yet_all_gaussians_are_to_fit(optimizer, monke
 def test_the_colors_of_a_plan_are_those_that_were_there_without_the_higher_coefficients(optimizer: Optimizer) -> None:
     optimizer.parameters["shN"].normal_()
     before = {name: value.clone() for name, value in optimizer.parameters.items()}
-    apply_plan(optimizer, Plan(steps=7, sh_degree=1, most=9))
-    assert (optimizer.config.steps, optimizer.config.sh_degree, optimizer.most) == (7, 1, 9)
+    apply_plan(optimizer, Plan(steps=7, sh_degree=1, max_gaussians=9))
+    assert (optimizer.config.steps, optimizer.config.sh_degree, optimizer.max_gaussians) == (7, 1, 9)
     for name, value in optimizer.parameters.items():
         np.testing.assert_array_equal(value, before[name][:, :3] if name == "shN" else before[name])
 
 
 def test_a_full_pruning_leaves_those_that_contribute_most_in_their_order(optimizer: Optimizer) -> None:
     every = optimizer.contributing()
-    optimizer.most = len(every) - 1
+    optimizer.max_gaussians = len(every) - 1
     fewer = optimizer.contributing()
     (missing,) = set(every.tolist()) - set(fewer.tolist())
     assert fewer.tolist() == [row for row in every.tolist() if row != missing]
-    optimizer.most = 1
+    optimizer.max_gaussians = 1
     (best,) = optimizer.contributing().tolist()
     assert best != missing
     # The one that is left is left by any threshold that leaves one.
-    optimizer.most = None
+    optimizer.max_gaussians = None
     for threshold in np.geomspace(1, 1e5, 12):
         optimizer.pruning = PruneConfig(contribution=float(threshold))
         try:

@@ -177,8 +177,8 @@ def _report_budget(
     image_scale = scale * config.data.image_scale
     chosen = {"image_scale": image_scale, "steps": result.steps, "sh_degree": plan.sh_degree}
     options = [f"data.image_scale={image_scale!r}", f"optimize.steps={plan.steps}"]
-    if plan.most is not None:
-        chosen["most_gaussians"] = plan.most
+    if plan.max_gaussians is not None:
+        chosen["most_gaussians"] = plan.max_gaussians
     options += [f"optimize.sh_degree={plan.sh_degree}", "budget.minutes=0"]
     predicted = {name: value for name in budget.limits if (value := getattr(plan, name)) is not None}
     run.report_choice(scene, chosen, predicted=predicted, notes=plan.notes, options=options)
