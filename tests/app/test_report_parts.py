@@ -53,11 +53,11 @@ UNSAFE = "<script>alert(1)<"
 
 @pytest.mark.slow
 def test_fusion_words_and_scores_have_pages_in_which_names_are_text(tmp_path: Path) -> None:
-    made = make_room(4, views=4, width=120, height=90)
+    made = make_room(4, views=4, width=64, height=48)
     write_room(made, tmp_path / UNSAFE)
     names = sorted({each.name for each in made.objects if each.name})
     save_text_table(tmp_path / "words", make_text_table(names, np.eye(len(names), dtype=np.float32), "room"))
-    common, seeds = ["report=true", "quiet=true"], "seeds.voxel=0.05"
+    common, seeds = ["report=true", "quiet=true"], "seeds.voxel=0.1"
     scene, teacher = str(tmp_path / UNSAFE), f"teacher.words={tmp_path / 'words'}"
     assert cli.main(["fuse", scene, teacher, seeds, f"out={tmp_path / 'f'}", *common]) == 0
     words = ",".join(names[:2])

@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from archives import header_of
-from forked_ranks import RankServer
 from safetensors.numpy import load_file
 from training_scenes import (
     LOSSES,
@@ -347,19 +345,3 @@ def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_on
     assert two.keys() == one.keys()
     for name, value in two.items():
         np.testing.assert_allclose(value, one[name], atol=2e-3)
-
-
-def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path, ranks: RankServer) -> None:
-    whole = script(dataset, tmp_path / "whole", steps=24, accumulate=1)
-    cut = script(dataset, tmp_path / "cut", steps=24, accumulate=1)
-    ranks.started(whole, count=1).end_well()
-    running = ranks.started(cut, count=1)
-    log, deadline = tmp_path / "cut" / LOG_FILE, time.monotonic() + 120
-    while time.monotonic() < deadline and not (log.is_file() and len(log.read_text().splitlines()) > 5):
-        time.sleep(0.02)
-    running.kill()
-    assert len(losses(tmp_path / "cut")) < 24
-    assert 0 < steps_in(tmp_path / "cut") < 24
-    ranks.started(cut, count=1).end_well()
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
-    assert_same_weights(tmp_path / "cut", tmp_path / "whole")

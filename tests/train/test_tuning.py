@@ -65,7 +65,7 @@ def tuned(model: Path, pairs: Pairs, tmp_path_factory: pytest.TempPathFactory) -
 
 def test_the_loss_on_twenty_pairs_falls_to_a_tenth(model: Path, pairs: Pairs, tmp_path: Path) -> None:
     lora = AdapterConfig(rank=16, alpha=32.0, dropout=0.0)
-    train = replace(SHORT.train, steps=30, batch=20, learning_rate=0.01, warmup=5)
+    train = replace(SHORT.train, steps=20, batch=20, learning_rate=0.01, warmup=5)
     tune(*pairs, model, TuneConfig(lora=lora, train=train), work=tmp_path)
     curve = losses(tmp_path)
     assert len(pairs[0]) == 20

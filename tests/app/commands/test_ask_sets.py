@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("openai")
 
 ROOMS = ("room_000", "room_001")
-QUICK = ("choose.candidates=4", "choose.count=2", "choose.judged_side=60", "choose.width=96", "choose.height=72")
+QUICK = ("choose.candidates=4", "choose.count=2", "choose.judged_side=60", "choose.width=64", "choose.height=48")
 
 
 @pytest.fixture(scope="module")

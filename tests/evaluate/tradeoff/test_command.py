@@ -45,7 +45,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def words_of(scene: Path, *more: str) -> list[str]:
     teacher = [f"teacher.words={scene / 'words.safetensors'}", "teacher.cell=8"]
-    return ["tradeoff", str(scene), *teacher, "seeds.voxel=0.08", "asked.min_views=1", "sweep.rounds=1", *more]
+    return ["tradeoff", str(scene), *teacher, "seeds.voxel=0.1", "asked.min_views=1", "sweep.rounds=1", *more]
 
 
 def table_of(out: Path) -> dict[tuple[str, str], dict[str, str]]:
@@ -94,17 +94,17 @@ def test_fusion_is_measured_against_the_exact_features(scene, tmp_path, capsys):
 
 def test_words_packages_and_views_have_scores_of_their_own(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    sweep = ["sweep.knobs=relative,form,candidates", "sweep.values=[relative:0.9,form:index/npz,candidates:4]"]
-    sweep += ["choose.candidates=8", "choose.count=2", "choose.width=64", "choose.height=48", "quiet=true"]
+    sweep = ["sweep.knobs=relative,form,candidates", "sweep.values=[relative:0.9,form:index/npz,candidates:3]"]
+    sweep += ["choose.candidates=6", "choose.count=2", "choose.width=48", "choose.height=36", "quiet=true"]
     stages = "stages=[localization,packages,views]"
     assert cli.main(words_of(scene, stages, "preset=exact", *sweep, f"out={out}")) == 0
     settings = json.loads((out / "summary.json").read_text())["settings"]
     assert settings["preset"] == "exact"
-    assert (settings["fusion"]["max_rank"], settings["choose"]["candidates"]) == (0, 8)
+    assert (settings["fusion"]["max_rank"], settings["choose"]["candidates"]) == (0, 6)
     rows = table_of(out)
     assert set(rows) == {
         ("localization", "defaults"), ("localization", "relative=0.9"), ("packages", "defaults"),
-        ("packages", "form=index"), ("packages", "form=npz"), ("views", "defaults"), ("views", "candidates=4"),
+        ("packages", "form=index"), ("packages", "form=npz"), ("views", "defaults"), ("views", "candidates=3"),
     }  # fmt: skip
     package, index, arrays = (rows["packages", each] for each in ("defaults", "form=index", "form=npz"))
     assert float(index["bytes"]) < float(package["bytes"]) < float(arrays["bytes"])
