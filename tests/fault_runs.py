@@ -305,7 +305,9 @@ def run_forked(asked: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     import fault_commands
+    from composed_once import compose_once
 
+    compose_once()
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     given = Path(sys.argv[1])

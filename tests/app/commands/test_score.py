@@ -21,6 +21,7 @@ from gsencoder.app import main as cli
 sys.exit(cli.main())
 """
 PROTOCOLS = {"recognition": (), "instances": ("protocol.proposals=truth",), "semantics": (), "referring": ()}
+SEEDS = "seeds.voxel=0.05"
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def evaluated(rooms: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     words = f"teacher.words={rooms / 'words.safetensors'}"
     for name, options in PROTOCOLS.items():
         out = f"out={folder / name}"
-        command = ["evaluate", *scenes, f"protocol={name}", words, *options]
+        command = ["evaluate", *scenes, f"protocol={name}", words, SEEDS, *options]
         assert cli.main([*command, "report=true", out, "quiet=true"]) == 0
     return {name: folder / name for name in PROTOCOLS}
 
@@ -91,7 +92,7 @@ def test_features_that_were_fused_from_the_labels_name_nearly_all_that_is_there(
 @pytest.mark.parametrize(("protocol", "count"), [("instances", 3)])
 def test_processes_that_share_the_scenes_score_each_of_them_once(protocol, count, rooms, evaluated, tmp_path, ranks):
     scenes = [str(rooms / f"room_{number}") for number in range(2)]
-    options = [f"protocol={protocol}", f"teacher.words={rooms / 'words.safetensors'}", *PROTOCOLS[protocol]]
+    options = [f"protocol={protocol}", f"teacher.words={rooms / 'words.safetensors'}", SEEDS, *PROTOCOLS[protocol]]
     words = ["evaluate", *scenes, *options, f"out={tmp_path / 'out'}", "quiet=true"]
     script = tmp_path / "run.py"
     script.write_text(COMMAND)
