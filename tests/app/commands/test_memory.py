@@ -1,6 +1,7 @@
 """`gsencoder memory`: what it writes is what localize, views and pack read; pictures; what is continued or refused."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from training_scenes import SMALL
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.core.logs import read_log
+from gsencoder.data.orbits import orbit_cameras
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features, load_memories, save_memories
@@ -171,7 +173,8 @@ def test_a_memory_of_predictions_has_their_mean_and_all_gaussians(room, teachers
     assert not (tmp_path / "other").exists()
 
 
-def test_a_bare_splat_is_drawn_by_its_renders(tmp_path: Path) -> None:
+def test_a_bare_splat_is_drawn_by_its_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsencoder.fusion.cameras.orbit_cameras", partial(orbit_cameras, width=128, height=96))
     gaussians = make_room(0, objects=2, views=1, width=8, height=6, spacing=0.15).gaussians
     save_splat(tmp_path / "room.ply", gaussians)
     out = f"out={tmp_path / 'of_splat'}"

@@ -16,8 +16,9 @@ from gsencoder.reconstruct import run as reconstruct
 av = pytest.importorskip("av")
 pytestmark = pytest.mark.slow
 
-QUICK = ["steps=6", "optimize.shrinks=[1]", "optimize.shares=[1.0]", "frames=12", "holdout=0", "quiet=true"]
-FRAMES = 36
+QUICK = ["steps=4", "optimize.shrinks=[1]", "optimize.shares=[1.0]", "frames=12", "holdout=0", "dense.spacing=4"]
+QUICK += ["quiet=true"]
+FRAMES = 18
 
 
 @pytest.fixture(scope="module")
@@ -45,13 +46,13 @@ def folder_run(video: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     (folder / "broken.mov").write_bytes(b"no video")
     words, out = ["reconstruct", str(folder), f"out={folder / 'out'}", *QUICK], folder / "out"
 
-    def stop_at_three(self: reconstruct.Optimizer) -> dict[str, float]:
-        if self.step == 3:
+    def stop_at_two(self: reconstruct.Optimizer) -> dict[str, float]:
+        if self.step == 2:
             raise KeyboardInterrupt
         return advance(self)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reconstruct.Optimizer, "advance", stop_at_three)
+        patch.setattr(reconstruct.Optimizer, "advance", stop_at_two)
         assert cli.main(words) == 130
     frames = {path.name: path.stat().st_mtime_ns for path in (out / "walk.reconstruction" / "images").iterdir()}
     with redirect_stderr(output), pytest.MonkeyPatch.context() as patch:

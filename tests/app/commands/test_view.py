@@ -125,6 +125,11 @@ ROOM = room_scene()
 def written(out: Path, *arguments: str | Path) -> tuple[list[Container], dict[str, Any]]:
     """The scenes of the page that a run writes, and the results in its summary."""
     assert cli.main(["view", *map(str, arguments), f"out={out}", "quiet=true"]) == 0
+    return page(out)
+
+
+def page(out: Path) -> tuple[list[Container], dict[str, Any]]:
+    """The scenes of a page, and the results in its summary."""
     matches = re.findall(r'id="scene-\d+">([^<]+)<', out.read_text())
     results: dict[str, Any] = json.loads(Path(f"{out}.summary.json").read_text())["results"]
     return [read_container(gzip.decompress(b64decode(blob))) for blob in matches], results
@@ -165,7 +170,7 @@ def test_harmonics_stay_and_the_last_line_names_their_degree(tmp_path, capsys):
     capsys.readouterr()
     assert cli.main(["view", *map(str, folders), f"out={tmp_path / 'a.html'}"]) == 0
     assert "spherical harmonics of degree 3" in " ".join(capsys.readouterr().out.split())
-    scenes, results = written(tmp_path / "b.html", *folders)
+    scenes, results = page(tmp_path / "a.html")
     assert results["sh_degree"] == [0, 3]
     # Both folders are called features; their paths tell them apart.
     assert [scene.meta["title"] for scene in scenes] == [str(each) for each in folders]
