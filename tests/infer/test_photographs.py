@@ -159,7 +159,7 @@ def test_a_photograph_counts_as_sharp_and_solid_however_rough_the_splat_is(tmp_p
             assert sight.worth > before.worth
             assert (sight.visible, sight.share, sight.inside) == (before.visible, before.share, before.inside)
     # Cameras around the target show renders still.
-    both = choose_views(with_photographs(rough, scene), [target], ViewsConfig(count=8, candidates=24))
+    both = choose_views(with_photographs(rough, scene), [target], ViewsConfig(count=8, candidates=16))
     placed = [each.target_scores[0] for each in both.chosen if each.frame is None]
     assert placed
     assert all(sight.blur > 0 for sight in placed)

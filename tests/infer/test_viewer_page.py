@@ -280,13 +280,13 @@ def test_options_of_a_file_bound_harmonics_features_and_photographs(search: Scen
         search, replace(scene, gaussians=replace(scene.gaussians, sh=sh.astype(np.float32)), views=ROOM.views)
     )
     errors = []
-    for degree, written, error in ((0, 0, 0.002), (1, 1, 0.05), (3, 2, OPTIONS.error)):
+    for degree, written, error in ((0, 0, 0.005), (1, 1, 0.1), (3, 2, 0.05)):
         made = file_container(rich, (), replace(OPTIONS, sh_degree=degree, error=error))
         errors.append(made.meta["featureError"])
         assert made.meta["shDegree"] == written
         (tmp_path / "a.spz").write_bytes(made.arrays["splat"].tobytes())
         assert load_splat(tmp_path / "a.spz").sh.shape[1] == (written + 1) ** 2
-    assert errors[0] <= 0.002 < errors[1] <= 0.05
+    assert errors[0] <= 0.005 < errors[1] <= 0.1
     sizes = made.meta["photographSizes"]
     assert len(sizes) == 3
     assert sum(sizes) == len(made.arrays["photographs"])
@@ -431,7 +431,11 @@ def colored(scene: Scene, degree: int) -> Scene:
     return replace(scene, gaussians=replace(scene.gaussians, sh=sh.astype(np.float32)))
 
 
-def fitted(search: SceneSearch, limit: int, *degrees: int, options: FileOptions = OPTIONS, **further: int) -> PageFile:
+# Features within a looser error take less time.
+COARSE = replace(OPTIONS, error=0.1)
+
+
+def fitted(search: SceneSearch, limit: int, *degrees: int, options: FileOptions = COARSE, **further: int) -> PageFile:
     scenes = [(colored(search.display.scene, degree), f"t{degree}", search.words) for degree in degrees]
     limits = {"max_gaussians": 10**6, "max_bytes": limit} | further
     return fitting_page(STUB, scenes, LocalizeConfig(), ROOM.objects, options, **limits)

@@ -19,7 +19,7 @@ from gsencoder.infer.views.targets import ViewsConfig, target_of
 
 pytestmark = pytest.mark.slow
 
-SHELLS = ViewsConfig(source="shells", count=4, width=160, height=120)
+SHELLS = ViewsConfig(source="shells", count=4, judged_side=40, width=80, height=60)
 
 
 def test_seconds_are_kept_and_more_of_them_never_judge_fewer_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,7 +40,7 @@ def test_seconds_are_kept_and_more_of_them_never_judge_fewer_candidates(monkeypa
         numbers.append(made.chosen["candidates"])
     assert numbers == [8, 16, 32]
     # The choice is that of so many candidates without a budget.
-    plain = choose_views(scene, [target], ViewsConfig(source="shells", count=4, width=160, height=120, candidates=32))
+    plain = choose_views(scene, [target], replace(SHELLS, candidates=32))
     assert [each.name for each in plain.chosen] == [each.name for each in made.views.chosen]
     assert plain.judged == made.views.judged
 
@@ -65,14 +65,15 @@ def test_what_a_budget_chooses_and_what_it_cannot_are_refused() -> None:
     check_views_budget(ViewsBudget(), ViewsConfig(method="uniform", candidates=16))
 
 
-def test_as_many_candidates_are_judged_as_views_are_asked_for_with_a_budget_and_without() -> None:
+def test_as_many_candidates_are_judged_as_views_are_asked_for_with_a_budget_and_without(monkeypatch):
+    monkeypatch.setattr(module, "CANDIDATES", (4, 8))
     scene, rows = room(step=0.12)
     target = target_of("cube", scene.gaussians, rows)
     config = ViewsConfig(source="shells", count=12, candidates=8, judged_side=40, width=80, height=60)
     assert choose_views(scene, [target], config).judged == 12
-    many = replace(config, count=70, candidates=32)
+    many = replace(config, count=36, candidates=32)
     made = choose_views_within(scene, [target], many, ViewsBudget(seconds=1e4))
-    assert made.chosen["candidates"] == made.views.judged == choose_views(scene, [target], many).judged == 70
+    assert made.chosen["candidates"] == made.views.judged == choose_views(scene, [target], many).judged == 36
 
 
 def test_frames_that_are_all_judged_are_the_candidates_that_are_reported() -> None:
