@@ -257,11 +257,14 @@ def test_rows_of_steps_that_are_done_again_are_taken_out_of_the_log(dataset: Pre
                 raise KeyboardInterrupt
             if step == 3:
                 first.save()
+                shutil.copy(tmp_path / TRAINING_CHECKPOINT_FILE, tmp_path / "third")
             yield step
 
     with pytest.raises(KeyboardInterrupt):
         first.run(stop_at_five)
-    assert len(losses(tmp_path)) == 5  # Two rows more than the checkpoint has steps.
+    # As a process leaves it that is killed: two rows more than the checkpoint has steps.
+    (tmp_path / "third").replace(tmp_path / TRAINING_CHECKPOINT_FILE)
+    assert (len(losses(tmp_path)), steps_in(tmp_path)) == (5, 3)
     trainer(dataset, tmp_path).run()
     assert [int(row["step"]) for row in read_log(tmp_path / LOG_FILE)] == list(range(1, 9))
 
