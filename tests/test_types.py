@@ -109,6 +109,12 @@ GRID: dict[str, Any] = {"grid_from_image": np.eye(2, 3), "space": FeatureSpace(n
 TABLE = np.eye(3, 2, dtype=np.float32)
 
 
+def test_a_space_has_one_channel_or_more():
+    assert FeatureSpace(name="a", channels=1).channels == 1
+    with pytest.raises(InputError, match="channels"):
+        FeatureSpace(name="a", channels=0)
+
+
 def test_a_map_is_in_one_form_and_knows_its_size():
     features, codes = np.zeros((3, 4, 2), np.float32), np.array([[-1, 0, 1, 2]] * 3, np.int32)
     shares = np.zeros((3, 4, 3), np.float32)
@@ -138,7 +144,7 @@ def test_shares_are_finite_and_not_negative(value):
 
 def test_codes_and_shares_belong_to_rows_of_their_table_and_those_to_the_space(no_jaxtyping):
     with pytest.raises(InputError, match=r"shares: expected 3 columns, got 4"):
-        FeatureMap(shares=np.ones((3, 4, 4), np.float32), table=TABLE, **GRID)
+        FeatureMap(shares=np.ones((3, 5, 4), np.float32), table=TABLE, **GRID)
     for wrong in (-2, 3):
         with pytest.raises(InputError, match=r"codes: expected -1 to 2, got"):
             FeatureMap(codes=np.array([[0, wrong]], np.int32), table=TABLE, **GRID)

@@ -151,6 +151,8 @@ def test_a_sample_holds_evenly_spaced_cells_that_have_a_vector() -> None:
     sample = CellSample(maps=2, limit=20)
     sample.add(feature_map(values))
     np.testing.assert_array_equal(sample.vectors(), values.reshape(-1, 6)[1::10])
+    with pytest.raises(InputError, match="no view has a cell with a vector"):
+        CellSample(0).vectors()
     empty = CellSample(1)
     for _ in range(2):
         with pytest.raises(InputError, match="no view has a cell with a vector"):
