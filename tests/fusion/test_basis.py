@@ -8,9 +8,17 @@ from training_scenes import SPACE as SIDES
 from training_scenes import TABLE, DenseSideTeacher, SideTeacher, scene
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.basis import Moments, ProjectionSums, fit_basis, project_maps, table_basis, to_coordinates
+from gsencoder.fusion.basis import (
+    Moments,
+    ProjectionSums,
+    distinct_rows,
+    fit_basis,
+    project_maps,
+    table_basis,
+    to_coordinates,
+)
 from gsencoder.render import blend
-from gsencoder.types import FeatureBasis, FeatureSpace
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
 
 SPACE = FeatureSpace(name="s", channels=24)
 
@@ -119,6 +127,14 @@ def test_the_basis_of_a_table_of_few_rows_is_that_of_its_covariance(rng: np.rand
     assert basis.rank == plain.rank
     np.testing.assert_allclose(basis.components, plain.components, atol=1e-6)
     assert basis.energy_kept == pytest.approx(plain.energy_kept, abs=1e-12)
+
+
+def test_each_row_of_a_table_that_occurs_in_a_coded_map_is_taken_once() -> None:
+    grid = {"grid_from_image": np.eye(2, 3), "space": SIDES, "table": TABLE}
+    assert (
+        distinct_rows(FeatureMap(codes=np.array([[-1, 0, 2, 2]], np.int32), **grid)).tolist() == TABLE[[0, 2]].tolist()
+    )
+    assert len(distinct_rows(FeatureMap(codes=np.full((2, 2), -1, np.int32), **grid))) == 0
 
 
 def test_bad_vectors_are_refused() -> None:
