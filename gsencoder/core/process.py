@@ -51,16 +51,31 @@ def stop_of(error: BaseException) -> Stopped | KeyboardInterrupt | None:
     return inner if isinstance(inner, Stopped | KeyboardInterrupt) else None
 
 
+def _import_depth(frame: FrameType | None) -> int:
+    """The number of imports that a frame is in."""
+    depth = 0
+    while frame is not None:
+        depth += frame.f_code.co_name == "_find_and_load"
+        frame = frame.f_back
+    return depth
+
+
 @contextmanager
 def stopping_signals() -> Iterator[None]:
     """Signals that end the process raise an exception within the block, for the main thread of a command; signals that
     are ignored (nohup) remain so. Python drops the exception where it is raised in a destructor or a weakref's
-    callback, as training does often enough to miss one: the signal is then sent once more."""
+    callback, as training does often enough to miss one, and libraries that it interrupts while they are imported drop
+    it or stay half imported: the signal is then sent once more."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
-    def stop(number: int, _: FrameType | None) -> None:
+    outer_imports = _import_depth(sys._getframe())
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if _import_depth(frame) > outer_imports:
+            threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
+            return
         raise Interrupted() if number == signal.SIGINT else Stopped(number)
 
     def send_again(dropped: Any) -> None:

@@ -6,7 +6,6 @@ loaders do. Work is cut into a fixed number of pieces, so that results do not de
 
 import contextlib
 import functools
-import importlib
 import os
 import sys
 import threading
@@ -187,13 +186,3 @@ def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1)
         finally:
             for future in pending:
                 future.cancel()
-
-
-def import_ahead(module: str) -> None:
-    """Starts to import a module in a thread. Whoever imports it later waits for that, and meets its errors."""
-
-    def load() -> None:
-        with contextlib.suppress(Exception):
-            importlib.import_module(module)
-
-    threading.Thread(target=load).start()

@@ -76,8 +76,6 @@ class TorchNetwork:
 
     def lower(self, *, half: bool = False) -> Any:
         """The network as an ONNX graph; see `gsencoder.infer.onnx.export.lower`."""
-        try:
-            from gsencoder.infer.onnx.export import lower
-        except ImportError as error:
-            raise InputError(f"export needs the package {error.name}: pip install 'gsencoder[export]'") from error
+        from gsencoder.infer.onnx.export import lower
+
         return lower(self.module, self.header, half=half)

@@ -1,5 +1,6 @@
 """Ranks, seconds and types of a process, words of messages, and work in pieces."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -218,6 +219,24 @@ def test_in_another_thread_nothing_is_installed() -> None:
 
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(work).result() == signal.getsignal(signal.SIGTERM)
+
+
+def test_a_signal_that_comes_while_a_library_is_imported_is_raised_after_it(tmp_path, monkeypatch):
+    library = (
+        "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGINT)\nexcept BaseException:\n    pass\nready = 1\n"
+    )
+    (tmp_path / "library_that_drops.py").write_text(library)
+    monkeypatch.syspath_prepend(tmp_path)
+    ready = []
+
+    def run() -> None:
+        with stopping_signals():
+            ready.append(importlib.import_module("library_that_drops").ready)
+            time.sleep(5)
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert ready == [1]
 
 
 def test_a_signal_whose_exception_a_destructor_drops_is_sent_again() -> None:

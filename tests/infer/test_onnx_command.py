@@ -50,6 +50,16 @@ def test_the_command_refuses_before_it_begins(words, message, tmp_path, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["taken.onnx"]
 
 
+def test_without_the_packages_of_an_export_it_says_what_to_install_and_still_has_help(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    monkeypatch.delitem(sys.modules, "gsencoder.infer.onnx.export", raising=False)
+    assert cli.main(["export", "--help"]) == 0
+    capsys.readouterr()
+    assert cli.main(["export", f"out={tmp_path / 'encoder.onnx'}"]) == 2
+    assert capsys.readouterr().err == "error: export needs the package onnx: pip install 'gsencoder[export]'\n"
+    assert not list(tmp_path.iterdir())
+
+
 def test_words_are_found_in_an_interpreter_that_has_no_torch_and_by_the_example(exported: Path, tmp_path: Path) -> None:
     cloud = random_cloud(2000, 0.05)
     # Half of the sheet is white and the other black, so that even an untrained encoder tells them apart.

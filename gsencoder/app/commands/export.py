@@ -17,7 +17,6 @@ from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.folder import load_memories
 from gsencoder.infer.encode import Cloud, Encoder, check_cosines, check_parity, file_of_encoder
-from gsencoder.infer.onnx.export import export_onnx, random_cloud
 from gsencoder.infer.onnx.runtime import SUFFIX
 from gsencoder.memory.attention import export_memory
 from gsencoder.models.output_space import copy_heads, find_heads, heads_of_graph, teacher_of_space
@@ -86,6 +85,8 @@ def run(config: ExportConfig, run: Run) -> None:
     if config.memory:
         _export_memory(config, config.out, run)
         return
+    from gsencoder.infer.onnx.export import export_onnx, random_cloud
+
     with run.step("load"):
         encoder = Encoder.load(config.weights)
         network = encoder.network

@@ -15,7 +15,6 @@ from gsencoder.app.scenes import load_feature_scene, load_query, memory_of, quer
 from gsencoder.core.errors import InputError, listed, one_line
 from gsencoder.core.files import write_json, write_picture
 from gsencoder.core.settings import option
-from gsencoder.core.threads import import_ahead
 from gsencoder.data.readers.transforms_json import read_cameras
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.up import with_up
@@ -57,9 +56,6 @@ def run(config: LocalizeCommandConfig, run: Run) -> None:
     """Reads features, finds each word, writes boxes as JSON and .ply, and draws them."""
     folder = Path(config.paths[0])
     words = query_words(config.query, config.queries)
-    if config.pictures:
-        # Drawing needs torch, which finding boxes does without; it takes as long to load as they take to find.
-        import_ahead("gsencoder.infer.pictures")
     with run.step("load"):
         scene, _ = with_up(load_feature_scene(folder, config.photos, config.data))
         queried, table = load_query(

@@ -19,15 +19,8 @@ from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
-import onnx
-import onnx_ir.passes.common as passes
 import torch
 from jaxtyping import Float32
-from onnx import helper, numpy_helper
-from onnxscript import FLOAT, INT8, INT32, INT64, UINT8, graph, ir, optimizer, script
-from onnxscript import opset18 as traced
-from onnxscript import opset20 as op
-from onnxscript.values import OnnxFunction, Opset
 
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
@@ -46,6 +39,17 @@ from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.grid import MAX_LEVELS, hilbert_table, start_orientation
 from gsencoder.models.raw_encoder import RawEncoder
 from gsencoder.types import Gaussians
+
+try:
+    import onnx
+    import onnx_ir.passes.common as passes
+    from onnx import helper, numpy_helper
+    from onnxscript import FLOAT, INT8, INT32, INT64, UINT8, graph, ir, optimizer, script
+    from onnxscript import opset18 as traced
+    from onnxscript import opset20 as op
+    from onnxscript.values import OnnxFunction, Opset
+except ImportError as error:
+    raise InputError(f"export needs the package {error.name}: pip install 'gsencoder[export]'") from error
 
 KNOWN_TORCH = "2.13"
 """The earliest release whose exporter translates encoders: 2.11 fails on slices whose sizes follow from data."""
