@@ -35,7 +35,7 @@ class Budget:
         for name in self.limits:
             value = self.limit(name)
             if name == "error" and not 0 < value < 1:
-                raise InputError(f"error: expected a number between 0 and 1, got {value}")
+                raise InputError(f"error: expected a number above 0 and below 1, got {value}")
             if not 0 < value < inf:
                 raise InputError(f"{name}: expected a number above 0, got {value}")
 

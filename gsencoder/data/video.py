@@ -254,9 +254,9 @@ def take_frames(
         record = json.loads(read_foreign_text(folder / RECORD_FILE))
         if record["asked"] == inputs and all((folder / name).is_file() for name in record["files"]):
             return tuple(record["files"])
+    video = Video(path)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    video = Video(path)
     small = track(video.frames(), "looking through the video")
     course = follow(_reformatted(frame, frame.width, frame.height, SIZE, "gray") for frame in small)
     if video.failure is not None or video.decoded < ENOUGH * video.seconds - 1:

@@ -185,7 +185,7 @@ def test_pack_writes_what_localize_reads(folder: Path, tmp_path: Path, capsys: p
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["error=0"], "budget.error: expected a number between 0 and 1"),
+        (["error=0"], "budget.error: expected a number above 0 and below 1"),
         (["error=1e-12"], "8 bits a coordinate reach"),
         (["decoded=true"], "form=compact holds codes"),
         (["form=pt"], "form"),

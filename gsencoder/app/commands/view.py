@@ -157,6 +157,7 @@ def _write(
             options,
             max_gaussians=config.max_gaussians,
             max_bytes=int(config.megabytes * 1e6),
+            track=run.track,
         )
     run.results.update(
         page=str(out),

@@ -29,6 +29,7 @@ from PIL import Image
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
+from gsencoder.core.process import Track, untracked
 from gsencoder.fusion.quantize import compact
 from gsencoder.infer.localize import LocalizeConfig, select_features
 from gsencoder.infer.page.search import (
@@ -293,6 +294,7 @@ def fitting_page(
     *,
     max_gaussians: int,
     max_bytes: int,
+    track: Track = untracked,
 ) -> PageFile:
     """The page with as much as fits: spherical harmonics are left out degree by degree, then Gaussians.
 
@@ -325,6 +327,7 @@ def fitting_page(
                 ),
                 words=words,
                 config=config,
+                track=track,
             )
             for scene, title, words in scenes
         ]

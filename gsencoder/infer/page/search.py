@@ -14,6 +14,7 @@ from jaxtyping import Float32, Int16, Int64, UInt8, UInt16
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.splats.packed import write_spz
 from gsencoder.data.splats.ply import RawSplat, logits_from_opacities, logs_from_scales
 from gsencoder.infer.draw import fit_pca_colors, pca_picture
@@ -168,11 +169,13 @@ class SceneSearch:
     Attributes:
         words: words in the space of its features; None where there are none.
         config: how words become boxes; the cosines are centered.
+        track: wraps the loop over all known words to show progress.
     """
 
     display: DisplayScene
     words: Words | None
     config: LocalizeConfig
+    track: Track = untracked
     products: GaussianProducts = field(init=False)
     spacing: float = field(init=False)
     _lock: threading.Lock = field(init=False, default_factory=threading.Lock)
@@ -226,7 +229,8 @@ class SceneSearch:
         """For each known word its boxes, its probability and its threshold, None where nothing was seen."""
         names, table = ((), None) if self.table is None else (self.table.names, self.table)
         blocks = [list(names[start : start + WORD_BLOCK]) for start in range(0, len(names), WORD_BLOCK)]
-        return [found for block in blocks if table for found in self._localized(block, table, self.config)]
+        tracked = self.track(blocks, "boxes of the known words")
+        return [found for block in tracked if table for found in self._localized(block, table, self.config)]
 
     def _localized(self, names: list[str], words: Words, config: LocalizeConfig) -> list[dict[str, Any]]:
         with warnings.catch_warnings():
