@@ -12,7 +12,7 @@ from PIL import Image
 from gsencoder.app.options import QueriesConfig
 from gsencoder.app.run import Run
 from gsencoder.app.scenes import load_feature_scene, load_query, memory_of, query_words
-from gsencoder.core.errors import InputError, listed, one_line
+from gsencoder.core.errors import InputError, counted, listed, one_line
 from gsencoder.core.files import write_json, write_picture
 from gsencoder.core.settings import option
 from gsencoder.data.readers.transforms_json import read_cameras
@@ -120,7 +120,7 @@ def _first_box(localization: Localization, word: str) -> str:
     size = " × ".join(f"{value:.3f}" for value in np.asarray(best.aabb_max - best.aabb_min))
     return (
         f"at ({center}), {size}, probability {best.probability:.2f}, score {best.score:.3f}, "
-        f"{len(best.rows):,} Gaussians ({len(boxes)} boxes)"
+        f"{len(best.rows):,} Gaussians ({counted(len(boxes), 'box', 'boxes')})"
     )
 
 
