@@ -19,7 +19,9 @@ def choose_device(name: Device, local_rank: int = 0) -> torch.device:
         return torch.device("cpu")
     count = torch.cuda.device_count()
     if local_rank >= count:
-        seen = f"process {local_rank} of this machine has no GPU, there are {count}" if count else "torch sees no GPU"
+        if not count:
+            raise InputError("device: torch sees no GPU; give device=cpu")
+        seen = f"process {local_rank} of this machine has no GPU, there are {count}"
         raise InputError(f"device: {seen}; give device=cpu, or start fewer processes")
     return torch.device("cuda", local_rank)
 
