@@ -72,19 +72,21 @@ def stopping_signals() -> Iterator[None]:
 
     outer_imports = _import_depth(sys._getframe())
 
+    def send_soon(number: int) -> None:
+        threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
+
     def stop(number: int, frame: FrameType | None) -> None:
         if _import_depth(frame) > outer_imports:
-            threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
-            return
-        raise Interrupted() if number == signal.SIGINT else Stopped(number)
+            send_soon(number)
+        else:
+            raise Interrupted() if number == signal.SIGINT else Stopped(number)
 
     def send_again(dropped: Any) -> None:
         if (stopped := stop_of(dropped.exc_value)) is None:
             report(dropped)
         else:
-            number = stopped.number if isinstance(stopped, Stopped) else signal.SIGINT
             # Not from here, where the exception of the handler would be dropped, too.
-            threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
+            send_soon(stopped.number if isinstance(stopped, Stopped) else signal.SIGINT)
 
     replaced = {number: signal.getsignal(number) for number in SIGNALS}
     replaced = {
