@@ -1,4 +1,4 @@
-"""Seconds of a fusion and of its steps: the labels teacher onto seeds of a scene.
+"""Seconds of a fusion: the labels teacher onto seeds of a scene.
 
     python bench/fusion.py SCENE [--runs 5]
 
@@ -39,8 +39,7 @@ def main() -> None:
         seconds, after = time.perf_counter() - start, os.times()
         digest = hashlib.sha256(fusion.features.features.tobytes() + fusion.features.weights.tobytes()).hexdigest()[:12]
         cpu = after.user - before.user + after.system - before.system
-        steps = ", ".join(f"{step} {taken:.2f}" for step, taken in fusion.seconds.items())
-        print(f"{seconds:.2f} s, {cpu:.2f} s of CPU time: {steps}; {digest}")
+        print(f"{seconds:.2f} s, {cpu:.2f} s of CPU time; {digest}")
         runs.append(seconds)
     figures = {
         "gaussians": len(scene.gaussians),
