@@ -67,6 +67,7 @@ CASES: dict[str, Case] = {
     "pack as ply": Case("pack GIVEN/features form=ply"),
     "evaluate": Case(f"evaluate {FUSED} protocol.min_views=1 protocol.min_pixels=1", other=("fusion.views=2",)),
     "evaluate instances": Case(f"evaluate {FUSED} protocol=instances"),
+    "rooms": Case("rooms GIVEN/library.sh3f types=[bathroom] walk.views=3 walk.width=32", several=True),
     "score": Case("score recognition predictions=GIVEN/named/predictions.json truth=GIVEN/named/truth.json"),
     "questions": Case("questions GIVEN/room min_pixels=10 per_kind=2 objects=2 per_object=1", other=("seed=1",)),
     "tune": Case(
@@ -155,14 +156,21 @@ def _bad_splat(given: Path) -> None:
     (given / "bad.ply").write_bytes(ply_bytes(columns))
 
 
+def _library(given: Path) -> None:
+    from furniture import write_library
+
+    write_library(given / "library.sh3f")
+
+
 INPUTS: dict[str, Callable[[Path], None]] = {
     "room": _room, "features": _features, "model": _model, "asked": _asked, "bad.ply": _bad_splat,
+    "library.sh3f": _library,
     "trained": lambda given: _run(given, f"train GIVEN/room {WORDS} tensorboard=false {TRAIN}", "trained"),
     "remembered": lambda given: _run(given, CASES["memory"].words, "remembered"),
     "named": lambda given: _run(given, f"evaluate {FUSED} protocol=recognition", "named"),
 }  # fmt: skip
 NEEDED = {"encode": ("trained",), "export": ("trained",), "export of a memory": ("remembered",), "score": ("named",)}
-NEEDED |= {"tune": ("model",), "ask of a set": ("asked",), "repair": ("bad.ply",)}
+NEEDED |= {"tune": ("model",), "ask of a set": ("asked",), "repair": ("bad.ply",), "rooms": ("library.sh3f",)}
 
 
 def prepare(given: Path, name: str) -> None:

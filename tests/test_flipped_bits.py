@@ -26,7 +26,7 @@ from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
 from gsencoder.app.options import SharedScenesConfig
 from gsencoder.app.output import output_file, output_folder
-from gsencoder.app.run import Run, _is_finished
+from gsencoder.app.run import Run, is_finished
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import checksums_of, warn_if_modified, with_checksum, write_bytes, write_json
@@ -201,7 +201,7 @@ def finished(folder: Path) -> Made:
     run = Run("fuse", SharedScenesConfig())
     with output_folder(folder / "out", record=run.to_dict) as out:
         (out / "a.txt").write_text("x")
-    return folder / "out" / "summary.json", lambda: _is_finished(folder / "out", run)
+    return folder / "out" / "summary.json", lambda: is_finished(folder / "out", run)
 
 
 def written(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]) -> Callable[[Path], Made]:

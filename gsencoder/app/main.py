@@ -86,6 +86,7 @@ _LISTED = (
         "ScoreConfig",
         "score files of predictions, of this program or another, against a benchmark's truth",
     ),
+    Command("rooms", "RoomsConfig", "make furnished rooms with photographs and labels from libraries of models"),
     Command("tradeoff", "TradeoffConfig", "measure what each knob of a stage costs and gains, alone and together"),
     Command("inspect", "InspectConfig", "show what a scene or a splat file holds, and what is wrong"),
     Command("repair", "RepairConfig", "mend a splat file, or the poses of a scene, and report the changes"),

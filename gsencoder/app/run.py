@@ -299,7 +299,7 @@ class Run:
             name = scene_name(path)
             target = self.config.out / name if self.config.out is not None else self.out(name, part)
             try:
-                if not overwrite and _is_finished(target, self):
+                if not overwrite and is_finished(target, self):
                     skipped += 1
                     continue
                 with self.of_scene(name, path, common) as run:
@@ -309,7 +309,7 @@ class Run:
             except InputError as error:
                 with suppress(InputError):
                     # Another process may have finished the scene in the meantime.
-                    if not overwrite and _is_finished(target, self):
+                    if not overwrite and is_finished(target, self):
                         continue
                 failures[path] = str(error) if str(error).startswith(f"{path}: ") else f"{path}: {error}"
                 print(one_line(f"failed: {failures[path]}"), file=sys.stderr)
@@ -381,7 +381,7 @@ class ScenesFailedError(InputError):
         self.reasons = reasons
 
 
-def _is_finished(target: Path, run: Run) -> bool:
+def is_finished(target: Path, run: Run) -> bool:
     """Whether a folder holds the results of this command with these settings; an InputError if it holds others."""
     try:
         record = json.loads(read_foreign_text(target / SUMMARY_NAME))

@@ -1,0 +1,294 @@
+"""Furniture libraries: archives of textured models with names and sizes, as Sweet Home 3D reads them.
+
+A library is an `.sh3f` file, a zip archive of OBJ files with their materials and pictures, and of
+`PluginFurnitureCatalog.properties`, whose lines `key#i=value` give the name, category, size in centimetres, elevation
+above the floor, and the height at which things stand on it, of model i. Models are y up and look along +z; here they
+are z up and look along −y, in metres, scaled to the size of the catalogue.
+"""
+
+import io
+import re
+import warnings
+import zipfile
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, UInt8
+from PIL import Image
+
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.errors import InputError, SceneWarning, error_prefix, listed, readable
+from gsencoder.data.furnished.kinds import Kind, kind_of
+
+CATALOGUE = "PluginFurnitureCatalog.properties"
+OUTDOORS = ("Characters", "Exterior", "Vehicles")
+"""Categories of a catalogue that rooms do not have."""
+MAX_FACES = 100_000
+"""Largest number of triangles of a model; larger ones are simplified."""
+MAX_TEXTURE = 256
+"""Largest side of a texture, pixels: finer than Gaussians of 2 cm show."""
+MAX_FILE = 1 << 28
+"""Largest size of an unpacked file of a library, bytes."""
+
+
+class Mesh(NamedTuple):
+    """Triangles with materials: a color each, and a picture for some."""
+
+    vertices: Float32[np.ndarray, "V 3"]
+    faces: Int32[np.ndarray, "F 3"]
+    uvs: Float32[np.ndarray, "F 3 2"]
+    materials: Int32[np.ndarray, " F"]
+    colors: Float32[np.ndarray, "M 3"]  # RGB in [0, 1]; of a texture its mean
+    textures: tuple[UInt8[np.ndarray, "h w 3"] | None, ...]
+
+    @property
+    def extent(self) -> Float64[np.ndarray, "2 3"]:
+        """The lower and upper corner."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)]).astype(np.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """A model of a library; lengths are metres.
+
+    Attributes:
+        id: unique among all libraries.
+        size: width (x), depth (y) and height (z).
+        elevation: of its lower side above the floor; 0 for what stands on it.
+        top: height above its lower side at which things stand on it; None if nothing does.
+    """
+
+    id: str
+    name: str
+    kind: Kind
+    size: tuple[float, float, float]
+    elevation: float
+    top: float | None
+    archive: Path
+    file: str
+    rotation: Float64[np.ndarray, "3 3"]
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The triangles; x and y are centered and the lower side is at z = 0."""
+        with error_prefix(f"{self.archive}: model {self.id}"):
+            mesh = _read_mesh(self.archive, self.file)
+            turned = mesh.vertices @ self.rotation.T
+            turned = np.stack([turned[:, 0], -turned[:, 2], turned[:, 1]], axis=1)
+            lower, upper = turned.min(axis=0), turned.max(axis=0)
+            if not (np.isfinite(turned).all() and (upper - lower).max() > 0):
+                raise InputError("expected faces that span a volume")
+            scale = np.array(self.size) / np.maximum(upper - lower, 1e-6 * (upper - lower).max())
+            origin = np.array([(lower[0] + upper[0]) / 2, (lower[1] + upper[1]) / 2, lower[2]])
+            return mesh._replace(vertices=((turned - origin) * scale).astype(np.float32))
+
+
+def load_libraries(paths: Sequence[str | Path]) -> tuple[Model, ...]:
+    """Reads the catalogues of libraries, given as `.sh3f` files or folders of such. Models of kinds that rooms do not
+    have are left out; warns of libraries in which no kind is known, such as those with names in another language."""
+    files = [file for path in paths for file in _library_files(Path(path))]
+    models: dict[str, Model] = {}
+    for file in files:
+        found, indoors = _read_catalogue(file)
+        if indoors and not found:
+            warnings.warn(
+                f"{file}: none of its models has a name that is known; names are expected in English", SceneWarning,
+                stacklevel=2,
+            )  # fmt: skip
+        for model in found:
+            if model.id in models:
+                raise InputError(
+                    f"{file}: model {model.id} is in {models[model.id].archive}, too; give each library once"
+                )
+            models[model.id] = model
+    if not models:
+        raise InputError(f"libraries: found no model of a known kind in {listed([str(file) for file in files])}")
+    return tuple(models[name] for name in sorted(models))
+
+
+def _library_files(path: Path) -> list[Path]:
+    with readable(path):
+        if path.is_file():
+            return [path]
+        files = sorted(path.glob("*.sh3f")) if path.is_dir() else []
+    if not files:
+        raise InputError(
+            f"{path}: expected a furniture library (.sh3f) or a folder of them; Debian's package sweethome3d-furniture "
+            "installs five in /usr/share/sweethome3d/furniture"
+        )
+    return files
+
+
+def _read_catalogue(file: Path) -> tuple[list[Model], int]:
+    """The models of one library whose kind is known, in the order of the catalogue, and the number of all models but
+    those that do not stand in rooms."""
+    with error_prefix(file):
+        rows: dict[int, dict[str, str]] = defaultdict(dict)
+        for line in _read_member(file, CATALOGUE).decode("latin-1").splitlines():
+            if match := re.fullmatch(r"\s*(\w+)#(\d+)\s*=\s*(.*?)\s*", line):
+                rows[int(match[2])][match[1]] = re.sub(
+                    r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), match[3]
+                )
+        if not rows:
+            raise InputError(f"{CATALOGUE}: expected lines such as name#1=Chair")
+        indoors = sum(row.get("category") not in OUTDOORS for row in rows.values())
+        return [model for number, row in sorted(rows.items()) if (model := _model_of(file, number, row))], indoors
+
+
+def _model_of(file: Path, number: int, row: dict[str, str]) -> Model | None:
+    name, category = row.get("name", ""), row.get("category", "")
+    model_id = row.get("id") or f"{file.stem}#{number}"
+    kind = kind_of(model_id, name, category)
+    if kind is None:
+        return None
+    with error_prefix(f"model {number} ({name})"):
+        width, depth, height = (_metres(row, key) for key in ("width", "depth", "height"))
+        if not 0 < min(width, depth, height) <= max(width, depth, height) < 20:
+            raise InputError(
+                f"expected a size in centimetres above 0 and below 2,000, got {100 * width:.6g} × {100 * depth:.6g} × "
+                f"{100 * height:.6g}"
+            )
+        rotation = np.array([float(number) for number in row.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()])
+        if rotation.size != 9 or "model" not in row:
+            raise InputError("expected a model's file, and a rotation of nine numbers if there is one")
+        top = _metres(row, "dropOnTopElevation") if "dropOnTopElevation" in row else height
+        return Model(
+            id=model_id,
+            name=name,
+            kind=kind,
+            size=(width, depth, height),
+            elevation=_metres(row, "elevation") if "elevation" in row else 0.0,
+            top=top if top >= 0 else None,
+            archive=file,
+            file=row["model"].lstrip("/"),
+            rotation=rotation.reshape(3, 3),
+        )
+
+
+def _metres(row: dict[str, str], key: str) -> float:
+    try:
+        return float(row[key]) / 100
+    except (KeyError, ValueError):
+        raise InputError(f"expected a number of centimetres as its {key}, got {row.get(key, 'none')!r}") from None
+
+
+def _read_member(file: Path, name: str) -> bytes:
+    """Reads a file of a library."""
+    with readable(file):
+        try:
+            with zipfile.ZipFile(file) as archive:
+                if archive.getinfo(name).file_size > MAX_FILE:
+                    raise InputError(f"{name}: is larger than {MAX_FILE >> 20} MiB")
+                return archive.read(name)
+        except KeyError:
+            raise InputError(f"expected the file {name} in it; the library is incomplete") from None
+        except (zipfile.BadZipFile, EOFError, ValueError) as error:
+            raise InputError(f"expected a zip archive, got a damaged one ({error})") from error
+
+
+def _read_mesh(file: Path, name: str) -> Mesh:
+    """Reads an OBJ file of a library with its materials; models of very many faces are simplified."""
+    import trimesh
+
+    with zipfile.ZipFile(file) as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        resolver = trimesh.resolvers.ZipResolver(
+            {entry: io.BytesIO(archive.read(entry)) for entry in archive.namelist() if _is_beside(entry, name)},
+            namespace=str(Path(name).parent),
+        )
+        try:
+            scene = trimesh.load(
+                io.BytesIO(_read_member(file, name)), file_type="obj", resolver=resolver, process=False, force="scene"
+            )
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{name}: expected an OBJ file ({type(error).__name__}: {error})") from error
+    parts = [each for each in scene.dump() if isinstance(each, trimesh.Trimesh) and len(each.faces)]
+    if not parts:
+        raise InputError(f"{name}: has no faces")
+    first = np.cumsum([0, *(len(each.vertices) for each in parts)])
+    looks = [_look(each) for each in parts]
+    mesh = Mesh(
+        vertices=np.concatenate([each.vertices for each in parts]).astype(np.float32),
+        faces=np.concatenate([each.faces + start for each, start in zip(parts, first, strict=False)]).astype(np.int32),
+        uvs=np.concatenate([_uvs(each) for each in parts]),
+        materials=np.repeat(np.arange(len(parts), dtype=np.int32), [len(each.faces) for each in parts]),
+        colors=np.stack([color for color, _ in looks]),
+        textures=tuple(texture for _, texture in looks),
+    )
+    return _simplified(mesh)
+
+
+def _simplified(mesh: Mesh) -> Mesh:
+    """Joins vertices of one cell of a grid, ever coarser, until a mesh has few enough triangles that have an area."""
+    cell = float(np.ptp(mesh.vertices, axis=0).max()) / 500
+    while len(mesh.faces) > MAX_FACES:
+        _, first, joined = np.unique(
+            np.round(mesh.vertices / max(cell, 1e-12)).astype(np.int64), axis=0, return_index=True, return_inverse=True
+        )
+        faces = joined.reshape(-1)[mesh.faces]
+        kept = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+        mesh = mesh._replace(
+            vertices=mesh.vertices[first],
+            faces=faces[kept].astype(np.int32),
+            uvs=mesh.uvs[kept],
+            materials=mesh.materials[kept],
+        )
+        cell *= 1.5
+    return mesh
+
+
+def _is_beside(entry: str, name: str) -> bool:
+    return Path(entry).parent == Path(name).parent and not entry.endswith("/")
+
+
+def _uvs(part: Any) -> Float32[np.ndarray, "F 3 2"]:
+    uv = getattr(part.visual, "uv", None)
+    if uv is None or len(uv) != len(part.vertices):
+        return np.zeros((len(part.faces), 3, 2), np.float32)
+    return np.nan_to_num(np.asarray(uv, np.float32))[part.faces]
+
+
+def _look(part: Any) -> tuple[Float32[np.ndarray, "3"], UInt8[np.ndarray, "h w 3"] | None]:
+    """The color and the texture of a part's material."""
+    material = getattr(part.visual, "material", None)
+    image = getattr(material, "image", None)
+    if isinstance(image, Image.Image):
+        picture = image.convert("RGB")
+        picture.thumbnail((MAX_TEXTURE, MAX_TEXTURE))
+        texture = np.array(picture)
+        return (texture.reshape(-1, 3).mean(axis=0) / 255).astype(np.float32), texture
+    color = getattr(material, "diffuse", None)
+    return (np.asarray([160, 160, 160] if color is None else color[:3], np.float32) / 255), None
+
+
+def held_out_models(models: Sequence[Model], fold: int = 0) -> frozenset[str]:
+    """The ids of one in four models of each kind that has three or more: makes that no training sees."""
+    by_kind: dict[str, list[str]] = defaultdict(list)
+    for model in models:
+        by_kind[model.kind.name].append(model.id)
+    chosen: list[str] = []
+    for ids in by_kind.values():
+        if len(ids) >= 3:
+            held = even_indices(len(ids), max(1, round(len(ids) / 4)))
+            chosen.extend(np.roll(sorted(ids), -fold)[held].tolist())
+    return frozenset(chosen)
+
+
+def select_makes(models: Sequence[Model], makes: Literal["all", "train", "held_out"]) -> tuple[Model, ...]:
+    """All models; those to train on; or those held out, with all models of the kinds of which none is."""
+    held = held_out_models(models)
+    kinds_held = {model.kind.name for model in models if model.id in held}
+    return tuple(
+        model
+        for model in models
+        if makes == "all"
+        or (makes == "train" and model.id not in held)
+        or (makes == "held_out" and (model.id in held or model.kind.name not in kinds_held))
+    )

@@ -1,0 +1,179 @@
+"""What a walk with a camera sees of a furnished home: frames with depth and labels, or a splat with labels."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, UInt8
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.settings import CheckedConfig, option
+from gsencoder.data.furnished.kinds import kinds
+from gsencoder.data.furnished.plan import Home
+from gsencoder.data.furnished.surfaces import Surfaces
+from gsencoder.data.labels.scans import with_counted_views
+from gsencoder.data.orbits import looking_cameras
+from gsencoder.data.seeding.depth import SurfaceGrid
+from gsencoder.data.seeding.points import flat_gaussians
+from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views
+
+CLEARANCE = 0.25
+"""Smallest distance of the camera from a surface, metres."""
+_GRAZING = 0.12
+"""Cosine between ray and normal below which a sensor measures no depth."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WalkConfig(CheckedConfig):
+    """Settings of the walk and of the sensor."""
+
+    views: int = option(24, "number of views of a room", ge=1, le=10_000)
+    width: int = option(320, "width of the views in pixels; the height is three quarters of it", ge=16, le=8192)
+    noise: float = option(1.0, "noise of the depth sensor, as a multiple of a structured-light camera's", ge=0, le=100)
+    drift: float = option(0.01, "largest error of a pose, metres; poses drift along the walk", ge=0, le=1)
+
+
+class Frame(NamedTuple):
+    """One view: colors, noisy depth (0 = none), the number of the item in each pixel (−1 = none), and normals."""
+
+    image: UInt8[np.ndarray, "H W 3"]
+    depth: Float32[np.ndarray, "H W"]
+    items: Int32[np.ndarray, "H W"]
+    normals: Float32[np.ndarray, "H W 3"]
+
+
+def walk_cameras(home: Home, surfaces: Surfaces, config: WalkConfig, rng: np.random.Generator) -> Cameras:
+    """Cameras of a walk through all rooms, at the height of eyes or hands, away from things."""
+    centers, targets = [], []
+    floor = sum((area.x1 - area.x0) * (area.y1 - area.y0) for _, area, _ in home.rooms)
+    for _, area, height in home.rooms:
+        count = max(3, round(config.views * (area.x1 - area.x0) * (area.y1 - area.y0) / floor))
+        lower, upper = [area.x0 + 0.2, area.y0 + 0.2, 1.1], [area.x1 - 0.2, area.y1 - 0.2, min(1.8, height - 0.3)]
+        points = rng.uniform(lower, upper, (40 * count, 3))
+        free = points[surfaces.distance(points) > CLEARANCE][:count]
+        if not len(free):
+            free = np.array([[*points[0, :2], min(height - 0.3, 2.0)]])
+        centers.append(_tour(free))
+        targets.append(rng.uniform([area.x0, area.y0, 0.0], [area.x1, area.y1, 0.8 * height], free.shape))
+    path = np.concatenate(centers)
+    forward = np.concatenate(targets) - path
+    # Not straight up or down.
+    forward[:, :2] += 0.3 * np.sign(forward[:, :2] + 1e-9)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    focal = config.width * float(rng.uniform(0.65, 1.0))
+    return looking_cameras(path, forward, np.array([0.0, 0.0, 1.0]), focal, config.width, config.width * 3 // 4)
+
+
+def _tour(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """The points in an order in which each is near to the one before."""
+    left, order = list(range(1, len(points))), [0]
+    while left:
+        nearest = min(left, key=lambda row: float(np.square(points[row] - points[order[-1]]).sum()))
+        left.remove(nearest)
+        order.append(nearest)
+    return points[order]
+
+
+def frame_of(surfaces: Surfaces, cameras: Cameras, view: int, config: WalkConfig, rng: np.random.Generator) -> Frame:
+    """Renders a view and measures its depth."""
+    rays = cameras.rays(view).astype(np.float32)
+    shape = rays.shape[:2]
+    directions = rays.reshape(-1, 3)
+    origins = np.broadcast_to(cameras.centers[view].astype(np.float32), directions.shape)
+    hits = surfaces.cast(origins, directions)
+    depth = np.where(np.isfinite(hits.distances), hits.distances, 0)
+    facing = -(directions * hits.normals).sum(axis=1) / np.linalg.norm(directions, axis=1)
+    # Structured light: the error of depth grows with its square (Khoshelham and Elberink 2012: 1.4 mm at 1 m).
+    sigma = config.noise * 0.0014 * depth**2
+    noisy = depth + rng.normal(0, 1, depth.shape) * sigma
+    lost = (
+        (facing < _GRAZING * min(config.noise, 1.0))
+        | (noisy <= 0.2)
+        | (rng.random(depth.shape) < 0.01 * min(config.noise, 1.0))
+    )
+    measured = np.where(lost | (hits.items < 0), 0, noisy).astype(np.float32)
+    return Frame(
+        image=np.rint(255 * np.where(hits.items[:, None] >= 0, hits.colors, 0.85)).astype(np.uint8).reshape(*shape, 3),
+        depth=measured.reshape(shape),
+        items=hits.items.reshape(shape),
+        normals=hits.normals.reshape(*shape, 3),
+    )
+
+
+def drifted(cameras: Cameras, drift: float, rng: np.random.Generator) -> Cameras:
+    """Poses with an error that grows and shrinks along the walk, at most `drift` metres."""
+    count = len(cameras)
+    if not drift or count < 2:
+        return cameras
+    steps = np.cumsum(rng.normal(0, 1, (count, 3)), axis=0)
+    steps -= steps.mean(axis=0)
+    poses = cameras.cam_from_world.copy()
+    poses[:, :3, 3] += (drift * steps / max(np.linalg.norm(steps, axis=1).max(), 1e-9)).astype(np.float32)
+    return replace(cameras, cam_from_world=poses)
+
+
+def objects_of(home: Home, surfaces: Surfaces) -> tuple[SceneObject, ...]:
+    """The things of a home as labeled objects, whose ids are their numbers + 1; boxes are full."""
+    return tuple(
+        SceneObject(
+            id=number + 1, name=item.kind, aabb_min=box[0], aabb_max=box[1],
+            placed=kinds()[item.kind].place == "surface", views=None, max_pixels=None,
+        )
+        for number, (item, box) in enumerate(zip(home.items, surfaces.boxes, strict=True))
+    )  # fmt: skip
+
+
+def furnished_scene(home: Home, name: str, config: WalkConfig, rng: np.random.Generator) -> Scene:
+    """A scene with photographs, depth, instance maps and objects."""
+    surfaces = Surfaces(home, rng)
+    cameras = walk_cameras(home, surfaces, config, rng)
+    frames = [frame_of(surfaces, cameras, view, config, rng) for view in range(len(cameras))]
+    scene = Scene(
+        name=name,
+        views=Views(
+            cameras=drifted(cameras, config.drift, rng),
+            names=tuple(f"images/{view:03d}.png" for view in range(len(cameras))),
+            images=[frame.image for frame in frames],
+            depths=[frame.depth for frame in frames],
+            instances=[frame.items + 1 for frame in frames],
+        ),
+        metres_per_unit=1.0,
+        up=np.array([0.0, 0.0, 1.0]),
+        objects=objects_of(home, surfaces),
+    )
+    return with_counted_views(scene)
+
+
+class LabeledSplat(NamedTuple):
+    """A splat, and the item that each Gaussian shows."""
+
+    gaussians: Gaussians
+    items: Int32[np.ndarray, " N"]
+    cameras: Cameras
+
+
+def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random.Generator) -> LabeledSplat:
+    """A splat of what a walk sees, as seeds from depth or as a tool fitted it, with labels."""
+    surfaces = Surfaces(home, rng)
+    cameras = walk_cameras(home, surfaces, config, rng)
+    believed = drifted(cameras, config.drift, rng)
+    grid = SurfaceGrid(voxel, np.zeros(3))
+    points, items = [], []
+    for view in range(len(cameras)):
+        frame = frame_of(surfaces, cameras, view, config, rng)
+        kept = frame.depth > 0
+        rays = believed.rays(view)[kept]
+        seen = (believed.centers[view] + rays * frame.depth[kept][:, None]).astype(np.float32)
+        tilted = frame.normals[kept] + rng.normal(0, 0.12 * config.noise, (len(seen), 3))
+        normals = (tilted / np.linalg.norm(tilted, axis=1, keepdims=True)).astype(np.float32)
+        grid.add(seen, normals, frame.image[kept])
+        points.append(seen)
+        items.append(frame.items[kept])
+    samples = grid.samples()
+    if not len(samples.points):
+        raise InputError("furnished: the walk sees nothing")
+    from scipy.spatial import cKDTree
+
+    _, nearest = cKDTree(np.concatenate(points)).query(samples.points, workers=1)
+    gaussians = flat_gaussians(samples.points, samples.normals, samples.colors, largest=voxel)
+    return LabeledSplat(gaussians, np.concatenate(items)[nearest].astype(np.int32), believed)

@@ -1,0 +1,140 @@
+"""Furniture libraries: sizes, axes, materials, makes, and what is wrong with a file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from furniture import BOX, MODELS, catalogue, write_library
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.furnished import library
+from gsencoder.data.furnished.kinds import kinds
+from gsencoder.data.furnished.library import Model, held_out_models, load_libraries, select_makes
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, ...]:
+    return load_libraries([write_library(tmp_path_factory.mktemp("library") / "test.sh3f")])
+
+
+def test_a_model_has_the_size_of_the_catalogue_and_stands_on_the_floor(models: tuple[Model, ...]) -> None:
+    for model in models:
+        lower, upper = model.mesh.extent
+        np.testing.assert_allclose(upper - lower, model.size, rtol=1e-5)
+        np.testing.assert_allclose((lower + upper)[:2], 0, atol=1e-6)
+        assert lower[2] == pytest.approx(0, abs=1e-6)
+
+
+def test_the_front_of_a_model_is_at_the_lower_side_of_y(models: tuple[Model, ...]) -> None:
+    """In the file the textured side is at −z of y up, the back of the model."""
+    mesh = models[0].mesh
+    textured = [number for number, texture in enumerate(mesh.textures) if texture is not None]
+    back = mesh.vertices[mesh.faces[np.isin(mesh.materials, textured)]].reshape(-1, 3)
+    sides = BOX.splitlines()[-1]
+    assert sides.startswith("f 1/1 4/2 8/3 5/4")  # x = −1
+    np.testing.assert_allclose(back[:, 0], mesh.vertices[:, 0].min())
+
+
+def test_materials_are_colors_and_pictures(models: tuple[Model, ...]) -> None:
+    mesh = models[0].mesh
+    by_texture = {texture is not None: color for texture, color in zip(mesh.textures, mesh.colors, strict=True)}
+    np.testing.assert_allclose(by_texture[False], [0.8, 0.2, 0.2], atol=0.01)
+    np.testing.assert_allclose(by_texture[True], [0, 0, 1], atol=0.01)
+
+
+def test_what_no_room_has_is_left_out(models: tuple[Model, ...]) -> None:
+    assert len(models) == len(MODELS) - 1
+    assert all(model.name != "Tractor" for model in models)
+
+
+def test_one_in_four_makes_of_a_kind_is_held_out_and_none_of_a_kind_of_fewer_than_three(
+    models: tuple[Model, ...],
+) -> None:
+    held = held_out_models(models)
+    chosen = [model.kind.name for model in models if model.id in held]
+    assert sorted(chosen) == ["chair", "table"]
+    train, others = select_makes(models, "train"), select_makes(models, "held_out")
+    assert not {model.id for model in train} & held
+    assert {model.id for model in train} | held == {model.id for model in models}
+    assert [model.id for model in others if model.kind.name in ("chair", "table")] == sorted(held)
+    assert {model.kind.name for model in others} == {model.kind.name for model in models}
+
+
+def test_a_model_of_many_faces_is_simplified_and_keeps_its_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    n = 60
+    grid = [(x, y) for x in range(n + 1) for y in range(n + 1)]
+    vertices = [f"v {x} {np.sin(x / 5) * 3 + 4:.4f} {y}" for x, y in grid]
+    row = n + 1
+    corners = [x * row + y + 1 for x in range(n) for y in range(n)]
+    faces = [f"f {at} {at + 1} {at + row + 1} {at + row}" for at in corners]
+    text = "\n".join([*vertices, *faces])
+    path = write_library(tmp_path / "fine.sh3f", catalogue(MODELS[:1]), {"box/box.obj": text.encode()})
+    monkeypatch.setattr(library, "MAX_FACES", 1000)
+    (model,) = load_libraries([path])
+    assert 100 < len(model.mesh.faces) <= 1000
+    np.testing.assert_allclose(np.ptp(model.mesh.extent, axis=0), model.size, rtol=0.05)
+
+
+def test_no_word_stands_for_two_kinds() -> None:
+    words = [word for kind in kinds().values() for word in kind.words]
+    assert len(words) == len(set(words))
+    assert all(word == word.strip().lower() for word in words)
+
+
+WRONG = {
+    "no library": (None, "expected a furniture library"),
+    "not a zip archive": (b"not a zip", "expected a zip archive"),
+    "half of a file": (b"PK\x03\x04" + bytes(50), "expected a zip archive"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_file_that_is_no_library_is_named(case: str, tmp_path: Path) -> None:
+    content, message = WRONG[case]
+    path = tmp_path / "wrong.sh3f"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as error:
+        load_libraries([path])
+    assert "wrong.sh3f" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"width": "0"}, "expected a size in centimetres"),
+        ({"height": "5000"}, "expected a size in centimetres"),
+        ({"depth": "wide"}, "expected a number of centimetres as its depth, got 'wide'"),
+        ({"modelRotation": "1 0 0"}, "a rotation of nine numbers"),
+    ],
+)
+def test_wrong_values_of_a_catalogue_are_named(more: dict[str, str], message: str, tmp_path: Path) -> None:
+    path = write_library(tmp_path / "test.sh3f", catalogue([("Chair", "Office", (50, 50, 90), more)]))
+    with pytest.raises(InputError, match=message):
+        load_libraries([path])
+
+
+def test_an_incomplete_library_and_a_model_without_faces_are_named(tmp_path: Path) -> None:
+    missing = write_library(tmp_path / "missing.sh3f", files={"box/box.obj": b""})
+    with pytest.raises(InputError, match=r"model test#1: .*expected the file box/box.obj"):
+        load_libraries([missing])[0].mesh  # noqa: B018
+    empty = write_library(tmp_path / "empty.sh3f", files={"box/box.obj": b"v 0 0 0\nv 1 1 1\n"})
+    with pytest.raises(InputError, match=r"model test#1: .*(no faces|expected an OBJ file)"):
+        load_libraries([empty])[0].mesh  # noqa: B018
+
+
+def test_names_in_another_language_are_warned_of(tmp_path: Path) -> None:
+    known = write_library(tmp_path / "known.sh3f")
+    foreign = write_library(tmp_path / "stuhl.sh3f", catalogue([("Stuhl", "Wohnzimmer", (50, 50, 90), {})]))
+    with pytest.warns(SceneWarning, match=r"stuhl.sh3f: none of its models has a name that is known"):
+        load_libraries([known, foreign])
+    with pytest.raises(InputError, match="no model of a known kind"), pytest.warns(SceneWarning):
+        load_libraries([foreign])
+
+
+def test_one_library_given_twice_is_refused(tmp_path: Path) -> None:
+    path = write_library(tmp_path / "test.sh3f")
+    with pytest.raises(InputError, match="give each library once"):
+        load_libraries([path, path])
