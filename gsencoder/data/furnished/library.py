@@ -198,7 +198,7 @@ def _read_mesh(file: Path, name: str) -> Mesh:
     with zipfile.ZipFile(file) as archive, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         resolver = trimesh.resolvers.ZipResolver(
-            {entry: io.BytesIO(archive.read(entry)) for entry in archive.namelist() if _is_beside(entry, name)},
+            {entry: io.BytesIO(archive.read(entry)) for entry in archive.namelist() if _is_sibling(entry, name)},
             namespace=str(Path(name).parent),
         )
         try:
@@ -244,7 +244,7 @@ def _simplified(mesh: Mesh) -> Mesh:
     return mesh
 
 
-def _is_beside(entry: str, name: str) -> bool:
+def _is_sibling(entry: str, name: str) -> bool:
     return Path(entry).parent == Path(name).parent and not entry.endswith("/")
 
 

@@ -94,6 +94,16 @@ class Room:
         along_x = side in (0, 2)
         return (self.area.x0, self.area.x1, True) if along_x else (self.area.y0, self.area.y1, False)
 
+    def at_wall(self, side: int, along: float, depth: float) -> tuple[float, float]:
+        """The point at a place along a wall, `depth` metres before it."""
+        area = self.area
+        return (
+            (along, area.y1 - depth),
+            (area.x1 - depth, along),
+            (along, area.y0 + depth),
+            (area.x0 + depth, along),
+        )[side]
+
     def is_free(self, box: Box) -> bool:
         area, slack = self.area, 1e-6
         inside = (
@@ -231,9 +241,16 @@ class _Furnisher:
         """A size close to the catalogue's, with slightly other proportions."""
         return self.rng.uniform(0.92, 1.1) * self.rng.uniform(0.95, 1.05, 3)
 
-    def _wall(self, kind: str, *, at: tuple[int, float] | None = None, scale: np.ndarray | None = None) -> Box | None:
+    def _wall(
+        self,
+        kind: str,
+        *,
+        at: tuple[int, float] | None = None,
+        scale: np.ndarray | None = None,
+        model: Model | None = None,
+    ) -> Box | None:
         """Puts a thing with its back to a wall: `at` is a side and the place along it, None = anywhere."""
-        model = self._draw(kind)
+        model = model or self._draw(kind)
         if model is None:
             return None
         size = self._scale() if scale is None else scale
@@ -245,13 +262,7 @@ class _Furnisher:
                 continue
             where = at[1] if at else self._along(first + half, last - half)
             depth = model.size[1] * size[1] / 2 + float(self.rng.uniform(0.005, 0.04))
-            area = self.room.area
-            x, y = {
-                0: (where, area.y1 - depth),
-                1: (area.x1 - depth, where),
-                2: (where, area.y0 + depth),
-                3: (area.x0 + depth, where),
-            }[side]
+            x, y = self.room.at_wall(side, where, depth)
             if (box := self._put(model, x, y, self._elevation(model, size), -side * math.pi / 2, size)) is not None:
                 return box
         return None
@@ -283,11 +294,19 @@ class _Furnisher:
                 return box
         return None
 
-    def _beside(
-        self, box: Box, kind: str, angle: float, gap: float, *, shift: float = 0.0, turn: float = 0.0
+    def _next_to(
+        self,
+        box: Box,
+        kind: str,
+        angle: float,
+        gap: float,
+        *,
+        shift: float = 0.0,
+        turn: float = 0.0,
+        model: Model | None = None,
     ) -> Box | None:
-        """Puts a thing beside a box, in the direction of an angle (a multiple of 90°), looking at it."""
-        model = self._draw(kind)
+        """Puts a thing next to a box, in the direction of an angle (a multiple of 90°), looking at it."""
+        model = model or self._draw(kind)
         if model is None:
             return None
         size = self._scale()
@@ -309,10 +328,10 @@ class _Furnisher:
         angle = math.atan2(facing[1], facing[0])
         for side in (-1, 1):
             if self.rng.random() < 0.7:
-                self._beside_wall(bed, "nightstand", angle, side)
+                self._flank(bed, "nightstand", angle, side)
         self._bedding(bed, angle)
 
-    def _beside_wall(self, box: Box, kind: str, angle: float, side: int) -> Box | None:
+    def _flank(self, box: Box, kind: str, angle: float, side: int) -> Box | None:
         """Puts a thing at the wall that a box stands against, on one side of the box."""
         wall = round(1 - angle / (math.pi / 2)) % 4
         first, last = (box.x0, box.x1) if wall in (0, 2) else (box.y0, box.y1)
@@ -323,7 +342,7 @@ class _Furnisher:
         half = model.size[0] * float(size[0]) / 2
         gap = float(self.rng.uniform(0.02, 0.12))
         where = first - half - gap if side < 0 else last + half + gap
-        return self._wall(kind, at=(wall, where), scale=size)
+        return self._wall(kind, at=(wall, where), scale=size, model=model)
 
     def _bedding(self, bed: Box, angle: float) -> None:
         """Pillows at the head of a bed and a blanket on it."""
@@ -375,11 +394,17 @@ class _Furnisher:
         angle = math.atan2(-back[1], -back[0])
         chair = "office chair" if self.rng.random() < 0.6 else "chair"
         if (
-            self._beside(desk, chair, angle, float(self.rng.uniform(-0.35, 0.25)), turn=float(self.rng.normal(0, 0.4)))
+            self._next_to(desk, chair, angle, float(self.rng.uniform(-0.35, 0.25)), turn=float(self.rng.normal(0, 0.4)))
             is None
         ):
-            self._beside(desk, chair, angle, 0.05)
-        for kind, share in (("monitor", 0.6), ("laptop", 0.4), ("keyboard", 0.5), ("desk lamp", 0.3), ("telephone", 0.2)):
+            self._next_to(desk, chair, angle, 0.05)
+        for kind, share in (
+            ("monitor", 0.6),
+            ("laptop", 0.4),
+            ("keyboard", 0.5),
+            ("desk lamp", 0.3),
+            ("telephone", 0.2),
+        ):
             if self.rng.random() < share:
                 self._on(desk, kind, angle)
 
@@ -389,11 +414,11 @@ class _Furnisher:
             return
         back = self.room.items[-1].matrix[:2, 1]
         angle = math.atan2(-back[1], -back[0])
-        table = self._beside(couch, "coffee table", angle, float(self.rng.uniform(0.25, 0.5)))
+        table = self._next_to(couch, "coffee table", angle, float(self.rng.uniform(0.25, 0.5)))
         if table is not None:
             for turn in (-math.pi / 2, math.pi / 2):
                 if self.rng.random() < 0.5:
-                    self._beside(table, "armchair", angle + turn, float(self.rng.uniform(0.2, 0.5)))
+                    self._next_to(table, "armchair", angle + turn, float(self.rng.uniform(0.2, 0.5)))
         stand = self._wall("tv stand", at=None)
         if stand is not None:
             self._on(stand, "tv", math.atan2(*(-self.room.items[-1].matrix[:2, 1])[::-1]))
@@ -416,7 +441,6 @@ class _Furnisher:
         chair = self._draw("chair")
         if chair is None:
             return
-        models, self.models = self.models, {**self.models, "chair": [chair]}
         for angle in (0.0, math.pi / 2, math.pi, -math.pi / 2):
             long = (table.y1 - table.y0) if abs(math.cos(angle)) > 0.5 else (table.x1 - table.x0)
             count = max(1, int(long / 0.62))
@@ -425,9 +449,8 @@ class _Furnisher:
                     shift = (number - (count - 1) / 2) * long / count
                     gap = float(self.rng.uniform(-0.25, 0.2))
                     turn = float(self.rng.normal(0, 0.15))
-                    if self._beside(table, "chair", angle, gap, shift=shift, turn=turn) is None:
-                        self._beside(table, "chair", angle, 0.03, shift=shift)
-        self.models = models
+                    if self._next_to(table, "chair", angle, gap, shift=shift, turn=turn, model=chair) is None:
+                        self._next_to(table, "chair", angle, 0.03, shift=shift, model=chair)
 
     def _kitchen_row(self) -> None:
         """Cabinets, a stove, a sink and a dishwasher along a wall, with a counter on them and cabinets above."""
@@ -464,9 +487,7 @@ class _Furnisher:
             width = model.size[0]
             if at + width > end:
                 break
-            kept, self.models = self.models, {**self.models, kind: [model]}
-            placed = self._wall(kind, at=(side, at + width / 2), scale=scale)
-            self.models = kept
+            placed = self._wall(kind, at=(side, at + width / 2), scale=scale, model=model)
             if placed is None or not low:
                 if at > start and low:
                     runs.append((start, at))
@@ -476,13 +497,7 @@ class _Furnisher:
             runs.append((start, at))
         for begin, finish in runs:
             middle, length = (begin + finish) / 2, finish - begin
-            area = self.room.area
-            x, y = {
-                0: (middle, area.y1 - depth / 2 - 0.02),
-                1: (area.x1 - depth / 2 - 0.02, middle),
-                2: (middle, area.y0 + depth / 2 + 0.02),
-                3: (area.x0 + depth / 2 + 0.02, middle),
-            }[side]
+            x, y = self.room.at_wall(side, middle, depth / 2 + 0.02)
             size = (length, depth + 0.03) if along_x else (depth + 0.03, length)
             self._shape("counter", slab(size[0], size[1], 0.035), x, y, height, "stone")
             box = Box(x - size[0] / 2, y - size[1] / 2, height, x + size[0] / 2, y + size[1] / 2, height + 0.035)
@@ -495,9 +510,7 @@ class _Furnisher:
                 model = upper[int(self.rng.integers(len(upper)))]
                 if where + model.size[0] > finish + 0.05:
                     break
-                kept, self.models = self.models, {**self.models, "kitchen cabinet": [model]}
-                self._wall("kitchen cabinet", at=(side, where + model.size[0] / 2), scale=np.ones(3))
-                self.models = kept
+                self._wall("kitchen cabinet", at=(side, where + model.size[0] / 2), scale=np.ones(3), model=model)
                 where += model.size[0]
 
     # Single and small things ---------------------------------------------------------------------------------------
@@ -537,13 +550,8 @@ class _Furnisher:
             return
         at = float(self.rng.uniform(first + size[0] / 2, last - size[0] / 2))
         z = float(self.rng.uniform(1.1, max(1.11, min(1.6, self.room.height - size[1] - 0.05))))
-        area, depth = self.room.area, 0.03
-        x, y = {
-            0: (at, area.y1 - depth / 2),
-            1: (area.x1 - depth / 2, at),
-            2: (at, area.y0 + depth / 2),
-            3: (area.x0 + depth / 2, at),
-        }[side]
+        depth = 0.03
+        x, y = self.room.at_wall(side, at, depth / 2)
         half = (size[0] / 2, depth / 2) if along_x else (depth / 2, size[0] / 2)
         box = Box(x - half[0], y - half[1], z, x + half[0], y + half[1], z + size[1])
         if self.room.is_free(box):
@@ -641,8 +649,8 @@ class _Furnisher:
         side, first, last, lower, upper = opening
         depth = min(model.size[1], 0.1)
         scale = np.array([(last - first) / model.size[0], depth / model.size[1], (upper - lower) / model.size[2]])
-        at, out, area = (first + last) / 2, THICKNESS / 2, self.room.area
-        x, y = {0: (at, area.y1 + out), 1: (area.x1 + out, at), 2: (at, area.y0 - out), 3: (area.x0 - out, at)}[side]
+        at = (first + last) / 2
+        x, y = self.room.at_wall(side, at, -THICKNESS / 2)
         matrix = pose(x, y, lower, -side * math.pi / 2, scale)
         self.room.items.append(Item(kind=kind, matrix=matrix, model=model))
 
@@ -657,13 +665,7 @@ class _Furnisher:
             begin, finish = max(begin, start + 0.02), min(finish, end - 0.02)
             if finish - begin < 0.1:
                 continue
-            at, depth, area = (begin + finish) / 2, 0.1, self.room.area
-            x, y = {
-                0: (at, area.y1 - depth),
-                1: (area.x1 - depth, at),
-                2: (at, area.y0 + depth),
-                3: (area.x0 + depth, at),
-            }[side]
+            x, y = self.room.at_wall(side, (begin + finish) / 2, 0.1)
             folds = int(self.rng.integers(3, 9))
             matrix = pose(x, y, bottom, -side * math.pi / 2, np.ones(3))
             self.room.items.append(
