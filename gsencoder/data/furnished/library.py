@@ -268,7 +268,7 @@ def _look(part: Any) -> tuple[Float32[np.ndarray, "3"], UInt8[np.ndarray, "h w 3
     return (np.asarray([160, 160, 160] if color is None else color[:3], np.float32) / 255), None
 
 
-def held_out_models(models: Sequence[Model], fold: int = 0) -> frozenset[str]:
+def held_out_models(models: Sequence[Model]) -> frozenset[str]:
     """The ids of one in four models of each kind that has three or more: makes that no training sees."""
     by_kind: dict[str, list[str]] = defaultdict(list)
     for model in models:
@@ -277,7 +277,7 @@ def held_out_models(models: Sequence[Model], fold: int = 0) -> frozenset[str]:
     for ids in by_kind.values():
         if len(ids) >= 3:
             held = even_indices(len(ids), max(1, round(len(ids) / 4)))
-            chosen.extend(np.roll(sorted(ids), -fold)[held].tolist())
+            chosen.extend(sorted(ids)[number] for number in held)
     return frozenset(chosen)
 
 

@@ -165,7 +165,7 @@ def _split(area: Rectangle, sizes: Sequence[float], rng: np.random.Generator) ->
 
 
 def _open_doorways(rooms: Sequence[Room], rng: np.random.Generator) -> None:
-    """Opens doorways between rooms that share a wall, so that all can be reached, and one to the outside."""
+    """Opens doorways between rooms that share a wall, until all can be reached if walls are long enough."""
     group = list(range(len(rooms)))
     for i, j in [(one, other) for one in range(len(rooms)) for other in range(one)]:
         for side, other in ((0, 2), (1, 3), (2, 0), (3, 1)):
@@ -218,15 +218,10 @@ class _Furnisher:
         found = self.models.get(kind, ())
         return found[int(self.rng.integers(len(found)))] if found else None
 
-    def _put(
-        self, model: Model, x: float, y: float, z: float, yaw: float, scale: np.ndarray, *, margin: float = 0.0
-    ) -> Box | None:
+    def _put(self, model: Model, x: float, y: float, z: float, yaw: float, scale: np.ndarray) -> Box | None:
         """Puts a model where it does not overlap anything else; returns its box, None if there is no space."""
         box = box_of(model, x, y, z, yaw, scale)
-        grown = Box(
-            box.x0 - margin, box.y0 - margin, box.z0 + 1e-4, box.x1 + margin, box.y1 + margin, box.z1
-        ) if margin else box  # fmt: skip
-        if not self.room.is_free(box) or (margin and not self._clear(grown)):
+        if not self.room.is_free(box):
             return None
         self.room.taken.append(box)
         self.room.items.append(Item(kind=model.kind.name, matrix=pose(x, y, z, yaw, scale), model=model))
@@ -234,8 +229,10 @@ class _Furnisher:
             self.supports.append((box, z + model.top * float(scale[2])))
         return box
 
-    def _clear(self, box: Box) -> bool:
-        return not any(box.overlaps(other) for other in self.room.taken)
+    def _front(self) -> float:
+        """The direction in which the thing that was placed last looks, as an angle."""
+        back = self.room.items[-1].matrix[:2, 1]
+        return math.atan2(-back[1], -back[0])
 
     def _scale(self) -> np.ndarray:
         """A size close to the catalogue's, with slightly other proportions."""
@@ -379,9 +376,8 @@ class _Furnisher:
             )
 
     def _shape(self, kind: str, shape: Mesh, x: float, y: float, z: float, finish: str) -> None:
-        if kind in kinds():
-            matrix = pose(x, y, z, 0.0, np.ones(3))
-            self.room.items.append(Item(kind=kind, matrix=matrix, shape=shape, finish=finish))
+        matrix = pose(x, y, z, 0.0, np.ones(3))
+        self.room.items.append(Item(kind=kind, matrix=matrix, shape=shape, finish=finish))
 
     def _bed_or_desk(self) -> None:
         self._desk() if self.rng.random() < 0.5 else self._wall("dresser")
@@ -390,8 +386,7 @@ class _Furnisher:
         desk = self._wall("desk") if self.rng.random() < 0.8 else self._anywhere("desk")
         if desk is None:
             return
-        back = self.room.items[-1].matrix[:2, 1]
-        angle = math.atan2(-back[1], -back[0])
+        angle = self._front()
         chair = "office chair" if self.rng.random() < 0.6 else "chair"
         if (
             self._next_to(desk, chair, angle, float(self.rng.uniform(-0.35, 0.25)), turn=float(self.rng.normal(0, 0.4)))
@@ -412,16 +407,15 @@ class _Furnisher:
         couch = self._wall("couch") if self.rng.random() < 0.75 else self._anywhere("couch")
         if couch is None:
             return
-        back = self.room.items[-1].matrix[:2, 1]
-        angle = math.atan2(-back[1], -back[0])
+        angle = self._front()
         table = self._next_to(couch, "coffee table", angle, float(self.rng.uniform(0.25, 0.5)))
         if table is not None:
             for turn in (-math.pi / 2, math.pi / 2):
                 if self.rng.random() < 0.5:
                     self._next_to(table, "armchair", angle + turn, float(self.rng.uniform(0.2, 0.5)))
-        stand = self._wall("tv stand", at=None)
+        stand = self._wall("tv stand")
         if stand is not None:
-            self._on(stand, "tv", math.atan2(*(-self.room.items[-1].matrix[:2, 1])[::-1]))
+            self._on(stand, "tv", self._front())
         if self.rng.random() < 0.6:
             self._rug(table or couch)
 
@@ -453,7 +447,7 @@ class _Furnisher:
                         self._next_to(table, "chair", angle, 0.03, shift=shift, model=chair)
 
     def _kitchen_row(self) -> None:
-        """Cabinets, a stove, a sink and a dishwasher along a wall, with a counter on them and cabinets above."""
+        """Cabinets, a stove, a sink and an oven along a wall, with a counter on them and cabinets above."""
         side = int(self.rng.integers(4))
         first, last, along_x = self.room.side(side)
         at, end = first + 0.02, last - 0.02
@@ -528,7 +522,7 @@ class _Furnisher:
 
     def _extras(self) -> None:
         names, weights = self._weights(("wall", "free", "mounted", "ceiling", "floor"))
-        area = (self.room.area.x1 - self.room.area.x0) * (self.room.area.y1 - self.room.area.y0)
+        area = self.room.area.size
         lower, upper = _EXTRAS[self.room.type]
         count = round(float(self.rng.uniform(lower, upper)) * min(2.0, max(0.5, area / 14)))
         for name in self.rng.choice(names, count, p=weights).tolist() if names else ():
@@ -557,8 +551,8 @@ class _Furnisher:
         if self.room.is_free(box):
             self.room.taken.append(box)
             mirror = self.room.type in ("bathroom", "bedroom", "corridor") and self.rng.random() < 0.4
-            kind, finish = ("mirror", "mirror") if mirror else ("picture", "picture")
-            self._shape(kind, slab(2 * half[0], 2 * half[1], float(size[1])), x, y, z, finish)
+            kind = "mirror" if mirror else "picture"
+            self._shape(kind, slab(2 * half[0], 2 * half[1], float(size[1])), x, y, z, kind)
 
     def _on(self, box: Box, kind: str, angle: float | None = None) -> Box | None:
         """Puts a thing on another, that looks in the direction of an angle."""

@@ -17,6 +17,11 @@ class Rectangle(NamedTuple):
     x1: float
     y1: float
 
+    @property
+    def size(self) -> float:
+        """Square metres."""
+        return (self.x1 - self.x0) * (self.y1 - self.y0)
+
 
 Quad = Float64[np.ndarray, "4 3"]
 

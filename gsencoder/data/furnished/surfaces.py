@@ -17,7 +17,6 @@ from gsencoder.data.furnished.plan import Home, Item
 
 TEXELS = 64
 """Side of the pictures that are made here, pixels."""
-SKY = 1e30
 
 
 class Look(NamedTuple):

@@ -27,7 +27,7 @@ _GRAZING = 0.12
 class WalkConfig(CheckedConfig):
     """Settings of the walk and of the sensor."""
 
-    views: int = option(24, "number of views of a room", ge=1, le=10_000)
+    views: int = option(24, "number of views of a home", ge=1, le=10_000)
     width: int = option(320, "width of the views in pixels; the height is three quarters of it", ge=16, le=8192)
     noise: float = option(1.0, "noise of the depth sensor, as a multiple of a structured-light camera's", ge=0, le=100)
     drift: float = option(0.01, "largest error of a pose, metres; poses drift along the walk", ge=0, le=1)
@@ -45,9 +45,9 @@ class Frame(NamedTuple):
 def walk_cameras(home: Home, surfaces: Surfaces, config: WalkConfig, rng: np.random.Generator) -> Cameras:
     """Cameras of a walk through all rooms, at the height of eyes or hands, away from things."""
     centers, targets = [], []
-    floor = sum((area.x1 - area.x0) * (area.y1 - area.y0) for _, area, _ in home.rooms)
+    floor = sum(area.size for _, area, _ in home.rooms)
     for _, area, height in home.rooms:
-        count = max(3, round(config.views * (area.x1 - area.x0) * (area.y1 - area.y0) / floor))
+        count = max(3, round(config.views * area.size / floor))
         lower, upper = [area.x0 + 0.2, area.y0 + 0.2, 1.1], [area.x1 - 0.2, area.y1 - 0.2, min(1.8, height - 0.3)]
         points = rng.uniform(lower, upper, (40 * count, 3))
         free = points[surfaces.distance(points) > CLEARANCE][:count]
@@ -153,7 +153,7 @@ class LabeledSplat(NamedTuple):
 
 
 def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random.Generator) -> LabeledSplat:
-    """A splat of what a walk sees, as seeds from depth or as a tool fitted it, with labels."""
+    """A splat of what a walk sees, as seeds from depth, with labels."""
     surfaces = Surfaces(home, rng)
     cameras = walk_cameras(home, surfaces, config, rng)
     believed = drifted(cameras, config.drift, rng)
