@@ -123,6 +123,10 @@ class TeacherSettings(CheckedConfig):
         words: str = getattr(self, "words", "")
         return load_text_table(find_file(words, "teacher.words")) if words else None
 
+    def adapt(self, words: Words) -> Words:
+        """The words of its space as this teacher has them."""
+        return words
+
     @property
     def stored_heads(self) -> tuple[str, ...]:
         """The names of the adapter heads that are stored with its features."""

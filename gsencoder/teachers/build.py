@@ -37,10 +37,11 @@ def words_of(config: TeacherConfig, text: TextConfig = TableTextConfig()) -> Wor
         text: a tower whose vectors the teacher's features are, or are made to be; its own table is not read then.
     """
     if isinstance(text, TableTextConfig):
-        return config.text_table()
+        table = config.text_table()
+        return None if table is None else config.adapt(table)
     if refusal := config.refuse_text():
         raise InputError(refusal)
-    return vocabulary_of(text)
+    return config.adapt(vocabulary_of(text))
 
 
 def options_of_member(name: str, config: TeacherConfig) -> AbstractContextManager[None]:

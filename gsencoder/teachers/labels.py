@@ -1,8 +1,11 @@
-"""The `labels` teacher: instance maps and a table of name embeddings. An exact oracle for labeled scenes."""
+"""The `labels` teacher: instance maps and a table of name embeddings. An exact oracle for labeled scenes.
+
+With `synonyms` the words of a kind of thing share one vector, so that "couch" and "sofa" are asked and trained alike.
+"""
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -10,9 +13,10 @@ from jaxtyping import Float32, Int32, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import option
+from gsencoder.data.furnished.kinds import kinds
 from gsencoder.teachers.base import MissingInput, Teacher, TeacherSettings
 from gsencoder.teachers.pictures import photograph
-from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.table import TextTable, make_text_table, unit
 from gsencoder.text.vocabulary import OpenVocabulary, Words, closed_table
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, SceneObject, Views
 
@@ -25,6 +29,33 @@ def codes_of(labels: Int32[np.ndarray, "H W"], row_of: dict[int, int]) -> Int32[
     rows = np.array([row_of[int(label)] for label in known], np.int32)
     nearest = np.searchsorted(known, labels).clip(max=len(known) - 1)
     return np.where(known[nearest] == labels, rows[nearest], np.int32(-1))
+
+
+def with_kinds(words: Words) -> Words:
+    """The words with one vector for all words of a kind of thing, the mean over those that are known, and for broader
+    words that over their kinds; a vocabulary with a tower gets the words that it lacks."""
+    if isinstance(words, OpenVocabulary):
+        names = [name for kind in kinds().values() for name in (*kind.words, *kind.hypernyms)]
+        vocabulary = words.including(dict.fromkeys(names))
+        return OpenVocabulary(_with_kinds(vocabulary.table), lambda: vocabulary.tower)
+    return _with_kinds(words)
+
+
+def _with_kinds(table: TextTable) -> TextTable:
+    vectors, broader = table.embeddings.copy(), dict[int, list[np.ndarray]]()
+    of_kinds: set[int] = set()
+    for kind in kinds().values():
+        rows = [row for word in kind.words if (row := table.find(word)) is not None]
+        if rows:
+            vectors[rows] = unit(table.embeddings[rows].mean(axis=0, keepdims=True))
+            of_kinds.update(rows)
+            for word in kind.hypernyms:
+                if (row := table.find(word)) is not None:
+                    broader.setdefault(row, []).append(vectors[rows[0]])
+    for row, below in broader.items():
+        if row not in of_kinds:
+            vectors[row] = unit(np.mean(below, axis=0, keepdims=True))[0]
+    return replace(table, embeddings=vectors)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,10 +74,17 @@ class LabelsConfig(TeacherSettings):
         1, "pixels along a cell; above 1 its vectors are averaged, as a teacher with patches sees them", ge=1
     )
 
+    synonyms: bool = option(
+        False, "one vector for all words of a kind of household thing, their mean: couch and sofa are the same"
+    )
+
     def __post_init__(self) -> None:
         TeacherSettings.__post_init__(self)
         if not self.words:
             raise InputError("words: the labels teacher needs a text table of its names")
+
+    def adapt(self, words: Words) -> Words:
+        return with_kinds(words) if self.synonyms else words
 
     def build(self, scene: Scene, words: Words | None) -> "LabelsTeacher":
         assert words is not None
@@ -87,7 +125,9 @@ class LabelsTeacher:
             )
         mean = words.mean.astype(np.float64)
         other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)
-        self.kinds = tuple(used)
+        # Names of one vector are the same thing.
+        things = {words.embeddings[row_of[name]].tobytes() for name in used}
+        self.kinds = tuple(name for name, row in row_of.items() if words.embeddings[row].tobytes() in things)
         self.names = ("other", *used)
         self.vectors = np.stack([other, *(words.embeddings[row_of[name]] for name in used)]).astype(np.float32)
         self.cell = cell

@@ -132,6 +132,7 @@ def fit_space(
     open_scene: OpenScene,
     config: PrepareConfig,
     *,
+    made: Sequence[Teacher] = (),
     optional: bool = False,
     process: ProcessRank = ProcessRank(),
     track: Track = untracked,
@@ -141,7 +142,9 @@ def fit_space(
     path = dataset.folder / SPACE_FILE
     with fail_together():
         if process.is_first and not path.is_file():
-            outputs, codebook, kinds = dataset_space(scenes, open_scene, config, optional=optional, track=track)
+            outputs, codebook, kinds = dataset_space(
+                scenes, open_scene, config, made=made, optional=optional, track=track
+            )
             arrays, header = output_space_parts(outputs)
             if codebook is not None:
                 arrays["codebook"] = codebook
@@ -156,6 +159,7 @@ def dataset_space(
     open_scene: OpenScene,
     config: PrepareConfig,
     *,
+    made: Sequence[Teacher] = (),
     optional: bool = False,
     track: Track = untracked,
 ) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None, tuple[str, ...]]:
@@ -164,6 +168,7 @@ def dataset_space(
     Args:
         open_scene: reads a scene and builds its teacher.
         config: the basis, the number of maps of a dense teacher, and whether targets are centered and scaled.
+        made: coded teachers of scenes that are made during the training.
         optional: leave out scenes that lack what the teacher needs, since they have other teachers.
 
     Returns:
@@ -182,6 +187,10 @@ def dataset_space(
         kinds |= dict.fromkeys(getattr(teacher, "kinds", ()))
         tables.append(teacher.table)
         mean = teacher.mean if teacher.mean is not None else mean
+    for teacher in made:
+        assert teacher.table is not None
+        kinds |= dict.fromkeys(getattr(teacher, "kinds", ()))
+        tables.append(teacher.table)
     space = spaces[0]
     use_basis = fusion.wants_basis(space)
     coordinates = basis = None

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from gsencoder.core.arrays import first_repeated
@@ -18,6 +19,7 @@ from gsencoder.core.errors import InputError, SceneWarning, error_prefix, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.core.settings import check_limits, option
+from gsencoder.data.furnished.kinds import kinds
 from gsencoder.data.labels.files import read_split
 from gsencoder.data.orbits import CamerasOfSplat
 from gsencoder.data.scenes import SceneConfig, load_scene
@@ -40,7 +42,8 @@ from gsencoder.train.prepare import (
     teacher_of_heads,
 )
 from gsencoder.train.prepared import SPACE_FILE, PreparedDataset
-from gsencoder.types import Scene
+from gsencoder.train.rooms import RoomsConfig
+from gsencoder.types import Scene, SceneObject
 
 TRAINED = "trained on"
 """What the settings of prepared scenes say of each scene that defines their space."""
@@ -72,9 +75,12 @@ class SourceConfig:
     )
     text: TextConfig = field(default_factory=TableTextConfig)
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
+    rooms: RoomsConfig = field(default_factory=RoomsConfig)
 
     def __post_init__(self) -> None:
         check_limits(self)
+        if self.rooms.libraries and self.labels_teacher is None:
+            raise InputError("rooms.libraries: made rooms have labels; expected teacher=labels, or labels in teachers=")
         wrong = [name for name in self.teachers if not re.fullmatch(TEACHER_NAME, name)]
         if wrong:
             raise InputError(f"teachers: expected names of letters, digits, _ and -, got {wrong[0]!r}")
@@ -91,6 +97,14 @@ class SourceConfig:
     def teachers_by_name(self) -> dict[str, TeacherConfig]:
         """The teachers of the training, one or several."""
         return dict(self.teachers) or {self.teacher.name: self.teacher}
+
+    @property
+    def labels_teacher(self) -> str | None:
+        """The name of the teacher whose targets are labels, one for each Gaussian; None where there is none."""
+        labels = [
+            name for name, each in self.teachers_by_name.items() if isinstance(each, LabelsConfig) and each.cell == 1
+        ]
+        return labels[0] if labels else None
 
     def load_words(self) -> dict[str, Words]:
         """The words of the teachers that have any, by teacher."""
@@ -203,7 +217,18 @@ def prepare_scenes(
     for name, dataset in datasets.items():
         open_scene = partial(reader.with_views, name)
         with _about_teacher(config, name):
-            fit_space(dataset, training, open_scene, config.prepare, optional=several, process=process, track=track)
+            with fail_together():
+                made = _made_rooms(name, words.get(name), config)
+            fit_space(
+                dataset,
+                training,
+                open_scene,
+                config.prepare,
+                made=made,
+                optional=several,
+                process=process,
+                track=track,
+            )
             with fail_together():
                 if unmeasured and name == with_heads:
                     views = config.prepare.basis_views
@@ -235,6 +260,15 @@ def prepare_scenes(
     for dataset in datasets.values():
         dataset.count_classes([path.name for path in training], track, process)
     return datasets
+
+
+def _made_rooms(name: str, words: Words | None, config: SourceConfig) -> list[Teacher]:
+    """The teacher of the rooms that are made during the training, if the one of this name has their labels."""
+    if not config.rooms.libraries or name != config.labels_teacher:
+        return []
+    box = np.zeros(3)
+    objects = [SceneObject(id=1 + i, name=kind, aabb_min=box, aabb_max=box) for i, kind in enumerate(kinds())]
+    return [config.teachers_by_name[name].build(Scene(name="rooms", objects=tuple(objects)), words)]
 
 
 @contextmanager
@@ -274,6 +308,7 @@ def _preparation_settings(
         "seeds": plain(config.seeds),
         "teacher": plain(teacher),
         "prepare": plain(config.prepare),
+        "rooms": bool(config.rooms.libraries),
         **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras, "voxel": voxel},
     }
     # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.

@@ -12,6 +12,7 @@ import hashlib
 import json
 import math
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -186,7 +187,66 @@ def digest_of_files(source: Path) -> str:
     return hashlib.sha256("\n".join(rows).encode()).hexdigest()[:16] if rows else ""
 
 
-class PreparedScene:
+class ScenePart(ABC):
+    """What one teacher says of a scene, by Gaussian and by view; targets are in standard units of the encoder."""
+
+    path: Path
+    name: str
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def cameras(self) -> Cameras: ...
+
+    @property
+    @abstractmethod
+    def view_names(self) -> tuple[str, ...]: ...
+
+    @property
+    @abstractmethod
+    def metres_per_unit(self) -> float | None: ...
+
+    @property
+    @abstractmethod
+    def up(self) -> Float64[np.ndarray, "3"] | None: ...
+
+    @property
+    @abstractmethod
+    def means(self) -> Float32[np.ndarray, "N 3"]: ...
+
+    @property
+    @abstractmethod
+    def weights(self) -> Float32[np.ndarray, " N"]:
+        """The weight of each Gaussian's target; 0 = it has none."""
+
+    @abstractmethod
+    def gaussians(self, rows: np.ndarray) -> Gaussians:
+        """Gaussians by row, with degree-0 colors."""
+
+    @abstractmethod
+    def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
+        """Targets by row; zero for Gaussians without a target."""
+
+    @abstractmethod
+    def float16_targets(self, rows: np.ndarray) -> Float16[np.ndarray, "n channels"]:
+        """The same in float16, as samples hold them."""
+
+    @abstractmethod
+    def codes(self, codebook: Float32[np.ndarray, "C channels"]) -> Int32[np.ndarray, " N"]:
+        """The class of each Gaussian's target, −1 without a target."""
+
+    @abstractmethod
+    def view(self, view: int) -> ViewRows:
+        """The blending matrix and the teacher's vectors of one view."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Closes what is open; the next access opens it again."""
+
+
+class PreparedScene(ScenePart):
     """A prepared scene, opened on first access, so that it can be sent to data workers."""
 
     def __init__(self, path: Path) -> None:
@@ -299,6 +359,13 @@ class PreparedScene:
         """Reads targets of the encoder by row, standard units; zero for Gaussians without a target."""
         with self._error_context():
             return self._scaled("targets", self._arrays.rows("targets", rows)).astype(np.float32, copy=False)
+
+    def codes(self, codebook: Float32[np.ndarray, "C channels"]) -> Int32[np.ndarray, " N"]:
+        """The class of each Gaussian's target, −1 without a target; it reads all targets."""
+        codes = np.full(len(self), -1, np.int32)
+        seen = np.flatnonzero(self.weights)
+        codes[seen] = nearest_codes(codebook, self.targets(seen))
+        return codes
 
     def float16_targets(self, rows: np.ndarray) -> Float16[np.ndarray, "n channels"]:
         """The same in float16, as samples hold them."""

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from gsencoder.core.files import plain
 from gsencoder.core.process import Device, ProcessRank, Track, untracked
 from gsencoder.core.settings import option
 from gsencoder.core.threads import threads_of_torch
+from gsencoder.data.furnished.kinds import kinds
+from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.measured_heads import heads_digest
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces
@@ -33,7 +35,8 @@ from gsencoder.train.loop import (
 from gsencoder.train.losses import TERMS, Distillation, Heads, LossConfig, TeacherRecipe, render_heads
 from gsencoder.train.prepare import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
-from gsencoder.train.prepared import PreparedDataset, PreparedScene
+from gsencoder.train.prepared import PreparedDataset, PreparedScene, nearest_codes
+from gsencoder.train.rooms import RoomStream
 from gsencoder.train.samples import (
     Augmentation,
     SampleDataset,
@@ -89,6 +92,12 @@ class TrainConfig(SourceConfig):
     model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: bool = option(True, "turn, mirror, scale, shift, thin and relight samples at random")
+    recolor: float = option(
+        0.0,
+        "share of augmented samples whose colors are permuted, inverted or gray, so that shapes are learned",
+        ge=0,
+        le=1,
+    )
     loss: LossConfig = field(default_factory=LossConfig)
     train: TrainerConfig = field(default_factory=TrainerConfig)
     prepare_threads: int = option(
@@ -208,13 +217,17 @@ def fit(
     recipe = SampleRecipe(
         encoder=config.model,
         sampling=config.sampling,
-        augmentation=Augmentation() if config.augment else None,
+        augmentation=Augmentation(recolor=config.recolor) if config.augment else None,
         losses=config.loss,
         teachers=teacher_recipes(datasets, config.loss),
         seed=config.train.seed,
         step_samples=config.train.samples_per_step(process.world_size),
     )
     outputs = OutputSpaces(by_teacher={name: dataset.load_space()[0] for name, dataset in datasets.items()})
+    stream = None
+    if config.rooms.libraries:
+        stream = room_stream(outputs, words, config, recipe)
+        recipe = replace(recipe, teachers=stream.balanced(recipe.teachers, track))
     score_encoder: Callable[[GaussianEncoder], ValidationResult] | None = None
     if validate is not None and held_out:
         held_out_parts = [_parts(datasets, path.name) for path in held_out]
@@ -228,7 +241,7 @@ def fit(
     encoder = GaussianEncoder(config.model, outputs.widths)
     trainer = encoder_trainer(
         encoder,
-        SampleDataset([TrainingScene(_parts(datasets, name)) for name in training], recipe),
+        SampleDataset([TrainingScene(_parts(datasets, name)) for name in training], recipe, stream),
         config.loss,
         config.train,
         folder=work,
@@ -246,6 +259,29 @@ def fit(
         scores = (trainer.last_validation or score_encoder(encoder)).scores
     tables = {name: _table_of(each, datasets[name]) for name, each in words.items()}
     return Training(encoder=encoder, outputs=outputs, tables=tables, state=state, scores=dict(scores))
+
+
+def room_stream(
+    outputs: OutputSpaces, words: Mapping[str, Words], config: TrainConfig, recipe: SampleRecipe
+) -> RoomStream:
+    """The rooms that are made during a training, with the classes of its labels."""
+    name = config.labels_teacher
+    assert name is not None
+    space, number = outputs[name], list(config.teachers_by_name).index(name)
+    codebook = recipe.teachers[number].class_balance.codebook
+    vectors = words[name].encode(list(kinds()))
+    coordinates = vectors if space.basis is None else to_coordinates(space.basis, vectors)
+    codes = nearest_codes(codebook, space.standardize(coordinates))
+    return RoomStream(
+        config.rooms,
+        codebook,
+        dict(zip(kinds(), codes.tolist(), strict=True)),
+        voxel=config.model.voxel,
+        teachers=len(recipe.teachers),
+        teacher=number,
+        step_samples=recipe.step_samples,
+        seed=config.train.seed,
+    )
 
 
 def teacher_recipes(datasets: Mapping[str, PreparedDataset], losses: LossConfig) -> tuple[TeacherRecipe, ...]:
@@ -303,7 +339,7 @@ def resume_settings(
     """What a run must share with the one that it resumes besides the settings of the loop, as JSON values; `heads` is
     the digest of the render loss's heads."""
     return {
-        **{name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "loss")},
+        **{name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "recolor", "loss", "rooms")},
         # The order, which a mapping does not have when it is compared, is that of the columns.
         "teachers": list(datasets),
         "spaces": {name: dataset.fingerprint() for name, dataset in datasets.items()},

@@ -9,7 +9,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, join_plans
 from gsencoder.train.losses import TERMS, Batch, LossConfig, RenderRows, TeacherRecipe, TeacherTargets
-from gsencoder.train.prepared import ClassBalance, PreparedScene, ViewRows, nearest_codes
+from gsencoder.train.prepared import ClassBalance, ScenePart, ViewRows
 from gsencoder.types import SH_C0, Cameras, Gaussians
 from gsencoder.types.scene import perpendicular
 
@@ -154,6 +154,9 @@ class Augmentation:
     light: float = 0.2  # largest relative change of brightness
     tint: float = 0.08  # largest relative change of each color channel, and largest shift of black
     noise: float = 0.02  # standard deviation of the noise added to each Gaussian's color; white = 1
+    recolor: float = 0.0  # probability that color channels are permuted, inverted or made gray, a third each
+    spread: float = 0.15  # standard deviation of the logarithm of a common factor of scales, and of one for each axis
+    fade: float = 0.3  # largest share of its opacity that a Gaussian loses
 
 
 def augment(
@@ -180,8 +183,32 @@ def augment(
     gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
     black_shift = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
     noise = rng.normal(0, config.noise, (len(turned.sh), 3))
-    relit = turned.sh * gain + ((black_shift + noise) / SH_C0)[:, None]
-    return replace(turned, means=(turned.means + shift).astype(np.float32), sh=relit.astype(np.float32))
+    relit = _recolored(turned.sh, rng, config.recolor) * gain + ((black_shift + noise) / SH_C0)[:, None]
+    factors = rng.normal(rng.normal(0, config.spread), config.spread, turned.scales.shape)
+    kept = 1 - rng.uniform(0, config.fade) * rng.random(len(turned.opacities))
+    return replace(
+        turned,
+        means=(turned.means + shift).astype(np.float32),
+        sh=relit.astype(np.float32),
+        scales=(turned.scales * np.exp(factors)).astype(np.float32),
+        opacities=(turned.opacities * kept).astype(np.float32),
+    )
+
+
+def _recolored(
+    sh: Float32[np.ndarray, "N 1 3"], rng: np.random.Generator, probability: float
+) -> Float[np.ndarray, "N 1 3"]:
+    """Colors of which things are not known: with other channels, inverted, or gray; and of another saturation."""
+    if rng.random() >= probability:
+        return sh
+    change = rng.integers(3)
+    gray = sh.mean(axis=2, keepdims=True)
+    if change == 0:
+        return np.repeat(gray, 3, axis=2)
+    # Colors are ½ + SH_C0·dc, so that the inverted ones have the negative coefficients.
+    changed = -sh if change == 1 else sh[:, :, rng.permutation(3)]
+    gray = changed.mean(axis=2, keepdims=True)
+    return gray + (changed - gray) * rng.uniform(0.3, 1.5)
 
 
 def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float) -> Gaussians:
@@ -346,10 +373,10 @@ def join_samples(samples: Sequence[Sample], patch: int) -> Batch:
 
 
 class TrainingScene:
-    """The prepared files of one scene, in the order of the teachers; None for those that the scene lacks. Gaussians and
-    cameras are read from the first."""
+    """What each teacher says of one scene, in the order of the teachers; None for those that the scene lacks. Gaussians
+    and cameras are read from the first."""
 
-    def __init__(self, parts: Sequence[PreparedScene | None]) -> None:
+    def __init__(self, parts: Sequence[ScenePart | None]) -> None:
         present = [part for part in parts if part is not None]
         if not present:
             raise InputError("training: a scene has no teacher")
@@ -407,21 +434,42 @@ Codes = tuple[Int32[np.ndarray, " N"] | None, ...]
 """For each teacher the class of each Gaussian's target, −1 without a target; None in a scene that lacks the teacher."""
 
 
-class SampleDataset(Dataset[Sample]):
-    """The samples of a run by number; each epoch goes through the scenes in a new random order."""
+@runtime_checkable
+class SceneStream(Protocol):
+    """Scenes that are made while a training runs, from which a share of its samples is drawn, by the sample's number;
+    see `rooms.RoomStream`."""
 
-    def __init__(self, scenes: Sequence[TrainingScene], recipe: SampleRecipe) -> None:
-        if not scenes:
+    share: float
+
+    def scene(self, number: int) -> tuple[TrainingScene, Codes]: ...
+
+
+class SampleDataset(Dataset[Sample]):
+    """The samples of a run by number; each epoch goes through the scenes in a new random order. With a `stream` a share
+    of the samples is of its scenes, and without other scenes all are."""
+
+    def __init__(
+        self, scenes: Sequence[TrainingScene], recipe: SampleRecipe, stream: SceneStream | None = None
+    ) -> None:
+        if not scenes and stream is None:
             raise InputError("training: no scenes to train on")
-        self.scenes, self.recipe = list(scenes), recipe
+        self.scenes, self.recipe, self.stream = list(scenes), recipe, stream
         self._codes: OrderedDict[int, Codes] = OrderedDict()
 
     def __getitem__(self, number: int) -> Sample:
-        epoch, position = divmod(number, len(self.scenes))
-        order = np.random.default_rng([self.recipe.seed, 0, epoch]).permutation(len(self.scenes))
-        rng = np.random.default_rng([self.recipe.seed, 1, number])
-        step_rng = np.random.default_rng([self.recipe.seed, 2, number // self.recipe.step_samples])
+        seed = self.recipe.seed
+        rng = np.random.default_rng([seed, 1, number])
+        step_rng = np.random.default_rng([seed, 2, number // self.recipe.step_samples])
         size = crop_size(self.recipe.sampling, step_rng)
+        stream, drawn = self.stream, number
+        if stream is not None:
+            if not self.scenes or np.random.default_rng([seed, 3, number]).random() < stream.share:
+                made, codes = stream.scene(number)
+                with error_prefix(made.name):
+                    return make_sample(made, codes, self.recipe, size, rng)
+            drawn = int(number * (1 - stream.share))
+        epoch, position = divmod(drawn, len(self.scenes))
+        order = np.random.default_rng([seed, 0, epoch]).permutation(len(self.scenes))
         scene_index = int(order[position])
         scene = self.scenes[scene_index]
         with error_prefix(f"scene {scene.name}"):
@@ -451,12 +499,10 @@ def target_codes(scene: TrainingScene, recipe: SampleRecipe) -> Codes:
         if part is None:
             result.append(None)
             continue
-        codes = np.full(len(part), -1, np.int32)
-        seen = np.flatnonzero(part.weights)
-        codes[seen] = (
-            nearest_codes(teacher.class_balance.codebook, part.targets(seen)) if recipe.uses_classes(teacher) else 0
-        )
-        result.append(codes)
+        if recipe.uses_classes(teacher):
+            result.append(part.codes(teacher.class_balance.codebook))
+        else:
+            result.append(np.where(part.weights > 0, np.int32(0), np.int32(-1)))
     return tuple(result)
 
 
@@ -501,7 +547,7 @@ def _weights_of(codes: Int32[np.ndarray, " N"], balance: ClassBalance, power: fl
 
 
 def _targets_of(
-    scene: PreparedScene,
+    scene: ScenePart,
     codes: Int32[np.ndarray, " N"],
     teacher: TeacherRecipe,
     losses: LossConfig,

@@ -419,7 +419,19 @@ def test_crops_are_of_sizes_in_equal_ratios() -> None:
     assert crop_size(SamplingConfig(gaussians=0), RNG(0)) == 0
 
 
-NOTHING = Augmentation(turn=0.0, tilt=0.0, mirror=0.0, scale=0.0, jitter=0.0, drop=0.0, light=0.0, tint=0.0, noise=0.0)
+NOTHING = Augmentation(
+    turn=0.0,
+    tilt=0.0,
+    mirror=0.0,
+    scale=0.0,
+    jitter=0.0,
+    drop=0.0,
+    light=0.0,
+    tint=0.0,
+    noise=0.0,
+    spread=0.0,
+    fade=0.0,
+)
 
 
 def splat() -> Gaussians:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt8
+from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import CheckedConfig, option
@@ -14,8 +14,8 @@ from gsencoder.data.furnished.surfaces import Surfaces
 from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.seeding.depth import SurfaceGrid
-from gsencoder.data.seeding.points import flat_gaussians
-from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views
+from gsencoder.data.seeding.points import OPACITY, SIZE, THICKNESS, quats_from_normals
+from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views, sh_from_colors
 
 CLEARANCE = 0.25
 """Smallest distance of the camera from a surface, metres."""
@@ -158,7 +158,7 @@ def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random
     cameras = walk_cameras(home, surfaces, config, rng)
     believed = drifted(cameras, config.drift, rng)
     grid = SurfaceGrid(voxel, np.zeros(3))
-    points, items = [], []
+    keys = []
     for view in range(len(cameras)):
         frame = frame_of(surfaces, cameras, view, config, rng)
         kept = frame.depth > 0
@@ -167,13 +167,36 @@ def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random
         tilted = frame.normals[kept] + rng.normal(0, 0.12 * config.noise, (len(seen), 3))
         normals = (tilted / np.linalg.norm(tilted, axis=1, keepdims=True)).astype(np.float32)
         grid.add(seen, normals, frame.image[kept])
-        points.append(seen)
-        items.append(frame.items[kept])
+        keys.append(_voxel_keys(seen, voxel) * len(home.items) + frame.items[kept])
     samples = grid.samples()
     if not len(samples.points):
         raise InputError("furnished: the walk sees nothing")
-    from scipy.spatial import cKDTree
+    items = _commonest(np.concatenate(keys), len(home.items), _voxel_keys(samples.points, voxel))
+    # Samples of one grid are about a voxel apart, so that spacings need not be measured.
+    size = np.full((len(items), 1), SIZE * voxel, np.float32)
+    gaussians = Gaussians(
+        means=samples.points,
+        quats=quats_from_normals(samples.normals),
+        scales=size * np.array([1, 1, THICKNESS], np.float32),
+        opacities=np.full(len(items), OPACITY, np.float32),
+        sh=sh_from_colors(samples.colors),
+    )
+    return LabeledSplat(gaussians, items, believed)
 
-    _, nearest = cKDTree(np.concatenate(points)).query(samples.points, workers=1)
-    gaussians = flat_gaussians(samples.points, samples.normals, samples.colors, largest=voxel)
-    return LabeledSplat(gaussians, np.concatenate(items)[nearest].astype(np.int32), believed)
+
+_AXIS = 1 << 14
+"""Voxels along each axis, as many as fit into keys with the numbers of items."""
+
+
+def _voxel_keys(points: Float32[np.ndarray, "n 3"], voxel: float) -> Int64[np.ndarray, " n"]:
+    x, y, z = (np.floor(points / np.float32(voxel)).astype(np.int64) + _AXIS // 2).T
+    return (x * _AXIS + y) * _AXIS + z
+
+
+def _commonest(keys: Int64[np.ndarray, " n"], count: int, voxels: Int64[np.ndarray, " m"]) -> Int32[np.ndarray, " m"]:
+    """The commonest item in each of some voxels, given voxel · count + item of all pixels."""
+    pairs, pixels = np.unique(keys, return_counts=True)
+    order = np.lexsort((-pixels, pairs // count))
+    sorted_voxels, first = np.unique(pairs[order] // count, return_index=True)
+    rows = np.searchsorted(sorted_voxels, voxels).clip(max=len(first) - 1)
+    return (pairs[order][first][rows] % count).astype(np.int32)

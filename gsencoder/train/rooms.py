@@ -1,0 +1,181 @@
+"""Furnished rooms as training samples: splats with labels and without photographs, made while a training runs, so that
+no two samples are alike.
+
+Room g of slot s of a run comes from (seed, s, g), and sample k from slot k mod S, where S is a multiple of the number
+of samples of a step: a process, or a data worker of it, makes the rooms of its own slots alone.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float16, Float32, Float64, Int32
+
+from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import CheckedConfig, option
+from gsencoder.data.furnished.library import Model, load_libraries, select_makes
+from gsencoder.data.furnished.plan import plan_home
+from gsencoder.data.furnished.walk import LabeledSplat, WalkConfig, furnished_splat
+from gsencoder.train.losses import TeacherRecipe
+from gsencoder.train.prepared import ScenePart, ViewRows
+from gsencoder.train.samples import Codes, TrainingScene
+from gsencoder.types import Cameras, Gaussians
+
+SLOTS = 16
+"""Smallest number of rooms from which samples are drawn in turn."""
+COUNTED = 24
+"""Number of rooms in which labels are counted, to weight rare ones."""
+VIEWS_PER_AREA = 1.3
+"""Views of a walk for each square metre of floor, beyond `FIRST_VIEWS`; they see most of what stands there."""
+FIRST_VIEWS, MAX_VIEWS = 14, 90
+VIEW_WIDTH = 160
+"""Width of the views, pixels: enough for a depth in each cell of 2 cm at 3 m."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoomsConfig(CheckedConfig):
+    """Settings of the rooms that are made during a training."""
+
+    libraries: tuple[str, ...] = option(
+        (), "furniture libraries (.sh3f) for rooms that are made while the training runs; empty = no such rooms"
+    )
+    share: float = option(0.75, "share of the samples that is from these rooms where scenes are given, too", gt=0, le=1)
+    samples: int = option(64, "number of samples from each room", ge=1, le=1_000_000)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LabeledPart(ScenePart):
+    """A splat with labels as the part of a training scene that a coded teacher has; see `ScenePart`."""
+
+    name: str
+    splat: LabeledSplat
+    codes_of_rows: Int32[np.ndarray, " N"]
+    codebook: Float32[np.ndarray, "C channels"]
+    path: Path = Path()
+    metres_per_unit: float | None = 1.0
+
+    def __len__(self) -> int:
+        return len(self.splat.gaussians)
+
+    @property
+    def means(self) -> Float32[np.ndarray, "N 3"]:
+        return self.splat.gaussians.means
+
+    @property
+    def cameras(self) -> Cameras:
+        return self.splat.cameras
+
+    @property
+    def weights(self) -> Float32[np.ndarray, " N"]:
+        return np.ones(len(self), np.float32)
+
+    @property
+    def view_names(self) -> tuple[str, ...]:
+        return tuple(f"view {view}" for view in range(len(self.cameras)))
+
+    @property
+    def up(self) -> Float64[np.ndarray, "3"]:
+        return np.array([0.0, 0.0, 1.0])
+
+    def gaussians(self, rows: np.ndarray) -> Gaussians:
+        return self.splat.gaussians.select(rows)
+
+    def codes(self, codebook: Float32[np.ndarray, "C channels"]) -> Int32[np.ndarray, " N"]:  # noqa: ARG002
+        return self.codes_of_rows
+
+    def targets(self, rows: np.ndarray) -> Float32[np.ndarray, "n channels"]:
+        return self.codebook[self.codes_of_rows[rows]]
+
+    def float16_targets(self, rows: np.ndarray) -> Float16[np.ndarray, "n channels"]:
+        return self.targets(rows).astype(np.float16)
+
+    def view(self, view: int) -> ViewRows:  # noqa: ARG002
+        """No rows: there is no photograph."""
+        none = np.zeros(0, np.float32)
+        return ViewRows(
+            crow=np.zeros(1, np.int64),
+            col=none.astype(np.int32),
+            weight=none,
+            targets=none.reshape(0, self.codebook.shape[1]),
+            valid=none.astype(bool),
+        )
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class RoomStream:
+    """The rooms of a training by the number of the sample; those of the slots in use are kept."""
+
+    def __init__(
+        self,
+        config: RoomsConfig,
+        codebook: Float32[np.ndarray, "C channels"],
+        code_of: Mapping[str, int],
+        *,
+        voxel: float,
+        teachers: int = 1,
+        teacher: int = 0,
+        step_samples: int = 1,
+        seed: int = 0,
+    ) -> None:
+        """Reads the libraries' catalogues.
+
+        Args:
+            codebook, code_of: vectors of the labels in standard units, and the row of each kind.
+            voxel: of the seeds, metres.
+            teachers, teacher: the number of teachers of the training, and which of them has the labels.
+            step_samples: samples of a step over all processes.
+        """
+        self.config, self.share = config, config.share
+        self._models: tuple[Model, ...] = select_makes(load_libraries(config.libraries), "train")
+        self._codebook, self._code_of, self._voxel, self._seed = codebook, code_of, voxel, seed
+        self._teachers, self._teacher = teachers, teacher
+        # An even number of steps, so that two data workers have slots of their own.
+        self.slots = step_samples * 2 * -(-SLOTS // (2 * step_samples))
+        self._rooms: dict[int, tuple[int, TrainingScene]] = {}
+
+    def scene(self, number: int) -> tuple[TrainingScene, Codes]:
+        """The room of a sample, and the classes of its Gaussians."""
+        slot, visit = number % self.slots, number // self.slots
+        # Rooms of different slots are replaced at different times.
+        generation = (visit + slot * self.config.samples // self.slots) // self.config.samples
+        if slot not in self._rooms or self._rooms[slot][0] != generation:
+            self._rooms[slot] = generation, self._make(slot, generation)
+        scene = self._rooms[slot][1]
+        return scene, tuple(None if part is None else part.codes(self._codebook) for part in scene.parts)
+
+    def _make(self, slot: int, generation: int) -> TrainingScene:
+        rng = np.random.default_rng([self._seed, 4, slot, generation])
+        part = self.labeled_part(rng, f"room {slot}.{generation}")
+        return TrainingScene([part if number == self._teacher else None for number in range(self._teachers)])
+
+    def labeled_part(self, rng: np.random.Generator, name: str) -> LabeledPart:
+        """Makes a room, seen on a walk with a sensor of random quality."""
+        home = plan_home(self._models, rng)
+        area = sum((floor.x1 - floor.x0) * (floor.y1 - floor.y0) for _, floor, _ in home.rooms)
+        walk = WalkConfig(
+            views=int(min(MAX_VIEWS, FIRST_VIEWS + VIEWS_PER_AREA * area)),
+            width=VIEW_WIDTH,
+            noise=float(rng.uniform(0.2, 1.5)),
+            drift=float(rng.uniform(0, 0.02)),
+        )
+        splat = furnished_splat(home, walk, self._voxel, rng)
+        of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
+        return LabeledPart(name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook)
+
+    def balanced(self, teachers: Sequence[TeacherRecipe], track: Track = untracked) -> tuple[TeacherRecipe, ...]:
+        """The teachers, with the frequencies of labels in a training of which `share` of the samples is from rooms."""
+        balance = teachers[self._teacher].class_balance
+        of_rooms = np.zeros(len(self._codebook))
+        for number in track(range(COUNTED), "counting labels of rooms"):
+            part = self.labeled_part(np.random.default_rng([self._seed, 5, number]), f"room {number}")
+            of_rooms += np.bincount(part.codes_of_rows, minlength=len(of_rooms))
+        counts = self.share * of_rooms / of_rooms.sum() + (1 - self.share) * balance.counts / balance.counts.sum()
+        # Frequencies become numbers of Gaussians again, since a class without any is told by its count.
+        mixed = replace(balance, counts=counts * (of_rooms.sum() + balance.counts.sum()))
+        return tuple(
+            replace(each, class_balance=mixed) if number == self._teacher else each
+            for number, each in enumerate(teachers)
+        )

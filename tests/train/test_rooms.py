@@ -1,0 +1,116 @@
+"""Rooms that are made during a training: they depend on the number of the sample, and have the teacher's labels."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from furniture import write_library
+from training_scenes import SMALL
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.furnished.kinds import kinds
+from gsencoder.data.furnished.library import load_libraries
+from gsencoder.train.loop import micro_batches
+from gsencoder.train.losses import LossConfig, TeacherRecipe
+from gsencoder.train.prepare_scenes import SourceConfig
+from gsencoder.train.prepared import ClassBalance
+from gsencoder.train.rooms import RoomsConfig, RoomStream
+from gsencoder.train.samples import Augmentation, SampleDataset, SampleRecipe, SamplingConfig
+
+CODE_OF = {kind: number for number, kind in enumerate(kinds())}
+CODEBOOK = np.random.default_rng(0).normal(size=(len(CODE_OF), 6)).astype(np.float32)
+
+
+@pytest.fixture(autouse=True)
+def _short_walks(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("MAX_VIEWS", 4), ("COUNTED", 4), ("SLOTS", 4)):
+        monkeypatch.setattr(f"gsencoder.train.rooms.{name}", value)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_library(tmp_path_factory.mktemp("library") / "test.sh3f")
+
+
+def stream(library: Path, **changes: object) -> RoomStream:
+    config = RoomsConfig(libraries=(str(library),), samples=2)
+    return RoomStream(config, CODEBOOK, CODE_OF, **{"voxel": 0.1, "seed": 1, **changes})  # type: ignore[arg-type]
+
+
+def recipe(**changes: object) -> SampleRecipe:
+    balance = ClassBalance(codebook=CODEBOOK, counts=np.ones(len(CODEBOOK)))
+    settings = {
+        "encoder": SMALL, "sampling": SamplingConfig(views=2, gaussians=300), "augmentation": Augmentation(recolor=1.0),
+        "losses": LossConfig(contrast_weight=1.0), "teachers": (TeacherRecipe(name="labels", class_balance=balance),),
+        "seed": 1, **changes,
+    }  # fmt: skip
+    return SampleRecipe(**settings)  # type: ignore[arg-type]
+
+
+def test_a_sample_depends_on_its_number_alone(library: Path) -> None:
+    first, second = (SampleDataset([], recipe(), stream(library)) for _ in range(2))
+    for number in (0, 1):
+        first[number]
+    one, other = first[33], second[33]
+    assert one.name == other.name
+    np.testing.assert_array_equal(one.attributes.numpy(), other.attributes.numpy())
+    np.testing.assert_array_equal(one.teachers[0].codes.numpy(), other.teachers[0].codes.numpy())
+
+
+def test_targets_are_the_vectors_of_the_labels(library: Path) -> None:
+    sample = SampleDataset([], recipe(), stream(library))[0]
+    (targets,) = sample.teachers
+    codes = targets.codes.numpy()
+    assert len(np.unique(codes)) > 1
+    np.testing.assert_array_equal(targets.targets.numpy(), CODEBOOK[codes].astype(np.float16))
+    assert (targets.loss_weights > 0).all()
+    assert len(targets.rows.row_weights) == 0
+
+
+def test_a_room_has_its_number_of_samples_before_the_next_takes_its_slot(library: Path) -> None:
+    rooms = stream(library)
+    names = [rooms.scene(rooms.slots * visit)[0].name for visit in range(6)]
+    assert names == ["room 0.0"] * 2 + ["room 0.1"] * 2 + ["room 0.2"] * 2
+    made = {rooms.scene(number)[0].name for number in range(rooms.slots)}
+    assert len(made) == rooms.slots
+
+
+@pytest.mark.parametrize("step", [(3, 1, 2), (1, 2, 3), (4, 1, 1)])
+def test_processes_and_two_workers_of_them_have_rooms_of_their_own(step: tuple[int, int, int], library: Path) -> None:
+    batch, accumulate, world = step
+    slots = stream(library, step_samples=batch * accumulate * world).slots
+
+    def of(rank: int) -> Iterator[set[int]]:
+        batches = micro_batches(0, 4 * slots, batch=batch, accumulate=accumulate, rank=rank, world=world)
+        for worker in range(2):
+            yield {number % slots for numbers in batches[worker::2] for number in numbers}
+
+    every = [numbers for rank in range(world) for numbers in of(rank)]
+    if accumulate == 1:
+        assert sum(map(len, every)) == len(set().union(*every))
+    assert set().union(*every) == set(range(slots))
+
+
+def test_no_held_out_make_stands_in_a_room(tmp_path: Path) -> None:
+    library = write_library(tmp_path / "test.sh3f")
+    every = load_libraries([library])
+    used = {model.id for model in stream(library)._models}
+    assert used < {model.id for model in every}
+
+
+def test_frequencies_are_those_of_the_mixture(library: Path) -> None:
+    counts = np.zeros(len(CODEBOOK))
+    counts[CODE_OF["toy"]] = 100.0
+    balance = ClassBalance(codebook=CODEBOOK, counts=counts)
+    (mixed,) = stream(library).balanced([TeacherRecipe(name="labels", class_balance=balance)])
+    shares = mixed.class_balance.counts / mixed.class_balance.counts.sum()
+    assert shares[CODE_OF["toy"]] == pytest.approx(0.25, abs=0.01)
+    assert shares[CODE_OF["wall"]] > 0.1
+
+
+def test_made_rooms_need_a_teacher_of_labels(library: Path) -> None:
+    from gsencoder.teachers.labels import PaletteConfig
+
+    with pytest.raises(InputError, match=r"rooms\.libraries: made rooms have labels; expected teacher=labels"):
+        SourceConfig(teacher=PaletteConfig(), rooms=RoomsConfig(libraries=(str(library),)))
