@@ -78,6 +78,10 @@ class LabelsConfig(TeacherSettings):
         False, "one vector for all words of a kind of household thing, their mean: couch and sofa are the same"
     )
 
+    others: bool = option(
+        True, "pixels without a name have the mean vector of the words, as something else; false = no vector at all"
+    )
+
     def __post_init__(self) -> None:
         TeacherSettings.__post_init__(self)
         if not self.words:
@@ -90,7 +94,7 @@ class LabelsConfig(TeacherSettings):
         assert words is not None
         if isinstance(words, OpenVocabulary):
             words = words.including(sorted({o.name for o in scene.objects if o.name is not None}))
-        return LabelsTeacher(scene.objects, closed_table(words), cell=self.cell)
+        return LabelsTeacher(scene.objects, closed_table(words), cell=self.cell, others=self.others)
 
     def refuse_text(self) -> str:
         return ""
@@ -99,15 +103,16 @@ class LabelsConfig(TeacherSettings):
 class LabelsTeacher:
     """Each pixel has the embedding of its object's name; pixels without a name the normalized mean of the table.
 
-    The mean is a direction too, so "other" is something that a Gaussian can be, and not a hole. Maps are coded: an
-    index for each pixel into the names of this scene. With `cell` above 1 they are dense: means over square cells,
-    what a perfect teacher with patches of that size would give; pixels over the last whole cell are left out.
+    The mean is a direction too, so "other" is something that a Gaussian can be, and not a hole; without `others` such
+    pixels say nothing. Maps are coded: an index for each pixel into the names of this scene. With `cell` above 1 they
+    are dense: means over square cells, what a perfect teacher with patches of that size would give; pixels over the
+    last whole cell are left out.
     """
 
     needs_images = False
     cheap = True
 
-    def __init__(self, objects: Sequence[SceneObject], words: TextTable, *, cell: int = 1) -> None:
+    def __init__(self, objects: Sequence[SceneObject], words: TextTable, *, cell: int = 1, others: bool = True) -> None:
         """Makes the scene's table; MissingInput without objects, InputError for a name that `words` lacks."""
         if not objects:
             raise MissingInput(
@@ -140,6 +145,7 @@ class LabelsTeacher:
             preprocessing=f"mean of {cell}×{cell} pixels" if cell > 1 else "",
             text_encoder=text_encoder,
         )
+        self._others = others
         self._code = {o.id: self.names.index(o.name) for o in objects if o.name is not None}
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
@@ -147,7 +153,7 @@ class LabelsTeacher:
         if views.instances is None:
             raise MissingInput("teacher labels: the scene has no instance maps (instance_file_path in transforms.json)")
         instances = views.instances[view]
-        codes = np.maximum(codes_of(instances, self._code), 0)
+        codes = np.maximum(codes_of(instances, self._code), 0 if self._others else -1).astype(np.int32)
         affine = np.array([[1 / self.cell, 0, 0], [0, 1 / self.cell, 0]])
         if self.table is not None:
             return FeatureMap(codes=codes, table=self.table, grid_from_image=affine, space=self.space)
@@ -157,11 +163,12 @@ class LabelsTeacher:
         cells = codes[: h * self.cell, : w * self.cell].reshape(h, self.cell, w, self.cell)
         shares = np.stack([(cells == code).mean(axis=(1, 3)) for code in range(len(self.names))], axis=-1)
         features = (shares @ self.vectors).astype(np.float32)
+        features[(cells < 0).any(axis=(1, 3))] = np.nan
         return FeatureMap(features=features, grid_from_image=affine, space=self.space)
 
     def settings(self) -> dict[str, Any]:
         digest = hashlib.sha256(self.vectors.tobytes() + repr(sorted(self._code.items())).encode()).hexdigest()[:16]
-        return {"name": "labels", "table": digest, "cell": self.cell}
+        return {"name": "labels", "table": digest, "cell": self.cell, "others": self._others}
 
 
 # The eleven basic color terms of English (Berlin & Kay 1969) and typical sRGB values, several where a name is wide.

@@ -29,6 +29,8 @@ COUNTED = 24
 VIEWS_PER_AREA = 1.3
 """Views of a walk for each square metre of floor, beyond `FIRST_VIEWS`; they see most of what stands there."""
 FIRST_VIEWS, MAX_VIEWS = 14, 90
+DENSITIES = (0.6, 1.4)
+"""Smallest and largest distance of the seeds, in voxels of the encoder."""
 VIEW_WIDTH = 160
 """Width of the views, pixels: enough for a depth in each cell of 2 cm at 3 m."""
 
@@ -124,7 +126,7 @@ class RoomStream:
 
         Args:
             codebook, code_of: vectors of the labels in standard units, and the row of each kind.
-            voxel: of the seeds, metres.
+            voxel: of the encoder, metres.
             teachers, teacher: the number of teachers of the training, and which of them has the labels.
             step_samples: samples of a step over all processes.
         """
@@ -152,7 +154,7 @@ class RoomStream:
         return TrainingScene([part if number == self._teacher else None for number in range(self._teachers)])
 
     def labeled_part(self, rng: np.random.Generator, name: str) -> LabeledPart:
-        """Makes a room, seen on a walk with a sensor of random quality."""
+        """Makes a room, seen on a walk with a sensor of random quality, with seeds of random density."""
         home = plan_home(self._models, rng)
         area = sum((floor.x1 - floor.x0) * (floor.y1 - floor.y0) for _, floor, _ in home.rooms)
         walk = WalkConfig(
@@ -161,7 +163,7 @@ class RoomStream:
             noise=float(rng.uniform(0.2, 1.5)),
             drift=float(rng.uniform(0, 0.02)),
         )
-        splat = furnished_splat(home, walk, self._voxel, rng)
+        splat = furnished_splat(home, walk, float(rng.uniform(*DENSITIES)) * self._voxel, rng)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
         return LabeledPart(name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook)
 

@@ -17,9 +17,11 @@ from gsencoder.teachers.labels import (
     LabelsTeacher,
     PaletteTeacher,
     lab_from_rgb,
+    with_kinds,
 )
 from gsencoder.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.text.table import make_text_table
+from gsencoder.text.vocabulary import closed_table
 from gsencoder.types import Scene, SceneObject, Views
 
 
@@ -79,6 +81,36 @@ def test_labels_give_each_pixel_its_name_and_the_rest_the_mean_direction() -> No
     other = embeddings.mean(axis=0) / np.linalg.norm(embeddings.mean(axis=0))
     for at in ((0, 0), (0, 2), (1, 2)):
         np.testing.assert_allclose(vectors[at], other, rtol=1e-6)
+
+
+@pytest.mark.parametrize("cell", [1, 2])
+def test_without_others_pixels_without_a_name_have_no_vector(cell: int) -> None:
+    words = make_text_table(("ball", "mug"), np.eye(2, 8, dtype=np.float32), "t")
+    teacher = LabelsTeacher(label_objects(), words, cell=cell, others=False)
+    instances = np.array([[3, 3, 3, 5], [3, 3, 9, 9]], np.int32)
+    feature_map = teacher.feature_map(views_of(instances=instances), 0)
+    if cell == 1:
+        assert feature_map.codes is not None
+        np.testing.assert_array_equal(feature_map.codes < 0, instances == 5)
+    else:
+        np.testing.assert_array_equal(np.isnan(feature_map.rows()).all(axis=1), [False, True])
+
+
+def test_words_of_a_kind_share_the_mean_of_their_vectors_and_broader_words_that_of_their_kinds() -> None:
+    names = ("couch", "sofa", "chair", "seat", "zebra")
+    vectors = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
+    table = make_text_table(names, vectors / np.linalg.norm(vectors, axis=1, keepdims=True), "test")
+    merged = closed_table(with_kinds(table))
+    couch, sofa, chair, seat, zebra = merged.embeddings
+    mean = table.embeddings[:2].mean(axis=0)
+    np.testing.assert_array_equal(couch, sofa)
+    np.testing.assert_allclose(couch, mean / np.linalg.norm(mean), atol=1e-6)
+    np.testing.assert_array_equal(chair, table.embeddings[2])
+    np.testing.assert_array_equal(zebra, table.embeddings[4])
+    np.testing.assert_allclose(seat, (couch + chair) / np.linalg.norm(couch + chair), atol=1e-6)
+    objects = (SceneObject(id=1, name="sofa", aabb_min=np.zeros(3), aabb_max=np.ones(3)),)
+    assert LabelsTeacher(objects, merged).kinds == ("couch", "sofa")
+    assert LabelsTeacher(objects, table).kinds == ("sofa",)
 
 
 def test_labels_without_objects_names_or_maps_say_so() -> None:

@@ -515,3 +515,27 @@ def test_centers_are_drawn_by_the_classes_of_the_first_teacher_that_a_scene_has(
         seen = np.flatnonzero(own.weights)
         expected[seen] = balance.target_weights(own.targets(seen), 1.0)
         np.testing.assert_allclose(given.pop(), expected, rtol=1e-5)
+
+
+def test_recolored_samples_keep_their_shapes_and_are_gray_inverted_or_permuted() -> None:
+    one = splat()
+    changes = set()
+    for seed in range(60):
+        changed = augment(one, np.random.default_rng(seed), replace(NOTHING, recolor=1.0), voxel=0.02)
+        np.testing.assert_allclose(changed.scales, one.scales)
+        gray, was_gray = changed.sh.mean(axis=2), one.sh.mean(axis=2)
+        saturated = np.ptp(changed.sh, axis=2).max() > 1e-4
+        kind = "gray" if not saturated else "inverted" if (gray * was_gray < 0).all() else "permuted"
+        np.testing.assert_allclose(gray, -was_gray if kind == "inverted" else was_gray, atol=1e-5)
+        changes.add(kind)
+    assert changes == {"gray", "inverted", "permuted"}
+
+
+def test_scales_and_opacities_vary_as_those_that_are_fitted() -> None:
+    one = splat()
+    changed = augment(one, np.random.default_rng(0), replace(NOTHING, spread=0.3, fade=0.5), voxel=0.02)
+    factors = np.log(changed.scales / one.scales)
+    assert 0.2 < factors.std() < 0.4
+    assert (changed.opacities <= one.opacities).all()
+    assert (changed.opacities >= 0.5 * one.opacities).all()
+    assert changed.opacities.min() < one.opacities.min()
