@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float16, Float32, Float64, Int32
 
+from gsencoder.core.errors import InputError, listed
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import CheckedConfig, option
+from gsencoder.data.furnished.kinds import kinds
 from gsencoder.data.furnished.library import Model, load_libraries, select_makes
 from gsencoder.data.furnished.plan import plan_home
 from gsencoder.data.furnished.walk import LabeledSplat, WalkConfig, furnished_splat
@@ -44,6 +46,20 @@ class RoomsConfig(CheckedConfig):
     )
     share: float = option(0.75, "share of the samples that is from these rooms where scenes are given, too", gt=0, le=1)
     samples: int = option(64, "number of samples from each room", ge=1, le=1_000_000)
+    without: tuple[str, ...] = option(
+        (), "kinds that no room has, to judge an encoder on kinds that it never saw", names=True
+    )
+
+    def __post_init__(self) -> None:
+        CheckedConfig.__post_init__(self)
+        unknown = [name for name in self.without if name not in kinds()]
+        if unknown:
+            raise InputError(f"rooms.without={unknown[0]}: no such kind; the kinds are {listed(list(kinds()), 8)}")
+
+    def models(self) -> tuple[Model, ...]:
+        """The models of the libraries that may stand in rooms."""
+        models = select_makes(load_libraries(self.libraries), "train")
+        return tuple(model for model in models if model.kind.name not in self.without)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,7 +147,7 @@ class RoomStream:
             step_samples: samples of a step over all processes.
         """
         self.config, self.share = config, config.share
-        self._models: tuple[Model, ...] = select_makes(load_libraries(config.libraries), "train")
+        self._models = config.models()
         self._codebook, self._code_of, self._voxel, self._seed = codebook, code_of, voxel, seed
         self._teachers, self._teacher = teachers, teacher
         # An even number of steps, so that two data workers have slots of their own.

@@ -187,6 +187,8 @@ def prepare(
 ) -> dict[str, PreparedDataset]:
     """Prepares the scenes of a training in a folder, with this process's share of the cores."""
     heads = required_heads(config.heads, config.teachers_by_name)
+    if config.rooms.libraries:
+        config.rooms.models()  # What cannot be read is an error before hours of preparation.
     place: dict[str, Any] = {"process": process, "device": device, "track": track}
     with threads_of_torch(cpu_share(process, config.prepare_threads)):
         return prepare_scenes(scenes, held_out, words, config, folder, voxel=config.model.voxel, heads=heads, **place)

@@ -99,6 +99,14 @@ def test_no_held_out_make_stands_in_a_room(tmp_path: Path) -> None:
     assert used < {model.id for model in every}
 
 
+def test_kinds_may_be_left_out_whole_and_misspelled_ones_are_named(library: Path) -> None:
+    config = RoomsConfig(libraries=(str(library),), without=("couch", "bed"))
+    every = {model.kind.name for model in RoomsConfig(libraries=(str(library),)).models()}
+    assert every - {model.kind.name for model in config.models()} == {"couch", "bed"}
+    with pytest.raises(InputError, match=r"rooms\.without=cauch: no such kind; the kinds are"):
+        RoomsConfig(without=("cauch",))
+
+
 def test_frequencies_are_those_of_the_mixture(library: Path) -> None:
     counts = np.zeros(len(CODEBOOK))
     counts[CODE_OF["toy"]] = 100.0
