@@ -19,7 +19,6 @@ from gsencoder.core.errors import InputError, SceneWarning, error_prefix, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.core.settings import check_limits, option
-from gsencoder.data.furnished.kinds import kinds
 from gsencoder.data.labels.files import read_split
 from gsencoder.data.orbits import CamerasOfSplat
 from gsencoder.data.scenes import SceneConfig, load_scene
@@ -42,7 +41,7 @@ from gsencoder.train.prepare import (
     teacher_of_heads,
 )
 from gsencoder.train.prepared import SPACE_FILE, PreparedDataset
-from gsencoder.train.rooms import RoomsConfig
+from gsencoder.train.samples import RoomsConfig
 from gsencoder.types import Scene, SceneObject
 
 TRAINED = "trained on"
@@ -266,6 +265,8 @@ def _made_rooms(name: str, words: Words | None, config: SourceConfig) -> list[Te
     """The teacher of the rooms that are made during the training, if the one of this name has their labels."""
     if not config.rooms.libraries or name != config.labels_teacher:
         return []
+    from gsencoder.data.furnished.kinds import kinds
+
     box = np.zeros(3)
     objects = [SceneObject(id=1 + i, name=kind, aabb_min=box, aabb_max=box) for i, kind in enumerate(kinds())]
     return [config.teachers_by_name[name].build(Scene(name="rooms", objects=tuple(objects)), words)]

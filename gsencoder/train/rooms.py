@@ -12,16 +12,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float16, Float32, Float64, Int32
 
-from gsencoder.core.errors import InputError, listed
 from gsencoder.core.process import Track, untracked
-from gsencoder.core.settings import CheckedConfig, option
-from gsencoder.data.furnished.kinds import kinds
 from gsencoder.data.furnished.library import Model, load_libraries, select_makes
 from gsencoder.data.furnished.plan import plan_home
 from gsencoder.data.furnished.walk import LabeledSplat, WalkConfig, furnished_splat
 from gsencoder.train.losses import TeacherRecipe
 from gsencoder.train.prepared import ScenePart, ViewRows
-from gsencoder.train.samples import Codes, TrainingScene
+from gsencoder.train.samples import Codes, RoomsConfig, TrainingScene
 from gsencoder.types import Cameras, Gaussians
 
 SLOTS = 16
@@ -35,31 +32,6 @@ DENSITIES = (0.6, 1.4)
 """Smallest and largest distance of the seeds, in voxels of the encoder."""
 VIEW_WIDTH = 160
 """Width of the views, pixels: enough for a depth in each cell of 2 cm at 3 m."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RoomsConfig(CheckedConfig):
-    """Settings of the rooms that are made during a training."""
-
-    libraries: tuple[str, ...] = option(
-        (), "furniture libraries (.sh3f) for rooms that are made while the training runs; empty = no such rooms"
-    )
-    share: float = option(0.75, "share of the samples that is from these rooms where scenes are given, too", gt=0, le=1)
-    samples: int = option(64, "number of samples from each room", ge=1, le=1_000_000)
-    without: tuple[str, ...] = option(
-        (), "kinds that no room has, to judge an encoder on kinds that it never saw", names=True
-    )
-
-    def __post_init__(self) -> None:
-        CheckedConfig.__post_init__(self)
-        unknown = [name for name in self.without if name not in kinds()]
-        if unknown:
-            raise InputError(f"rooms.without={unknown[0]}: no such kind; the kinds are {listed(list(kinds()), 8)}")
-
-    def models(self) -> tuple[Model, ...]:
-        """The models of the libraries that may stand in rooms."""
-        models = select_makes(load_libraries(self.libraries), "train")
-        return tuple(model for model in models if model.kind.name not in self.without)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,6 +95,12 @@ class LabeledPart(ScenePart):
         """Nothing is open."""
 
 
+def models_of(config: RoomsConfig) -> tuple[Model, ...]:
+    """The models of the libraries that may stand in rooms."""
+    models = select_makes(load_libraries(config.libraries), "train")
+    return tuple(model for model in models if model.kind.name not in config.without)
+
+
 class RoomStream:
     """The rooms of a training by the number of the sample; those of the slots in use are kept."""
 
@@ -147,7 +125,7 @@ class RoomStream:
             step_samples: samples of a step over all processes.
         """
         self.config, self.share = config, config.share
-        self._models = config.models()
+        self._models = models_of(config)
         self._codebook, self._code_of, self._voxel, self._seed = codebook, code_of, voxel, seed
         self._teachers, self._teacher = teachers, teacher
         # An even number of steps, so that two data workers have slots of their own.

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from gsencoder.core.files import plain
 from gsencoder.core.process import Device, ProcessRank, Track, untracked
 from gsencoder.core.settings import option
 from gsencoder.core.threads import threads_of_torch
-from gsencoder.data.furnished.kinds import kinds
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.measured_heads import heads_digest
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
@@ -36,7 +35,6 @@ from gsencoder.train.losses import TERMS, Distillation, Heads, LossConfig, Teach
 from gsencoder.train.prepare import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
 from gsencoder.train.prepared import PreparedDataset, PreparedScene, nearest_codes
-from gsencoder.train.rooms import RoomStream
 from gsencoder.train.samples import (
     Augmentation,
     SampleDataset,
@@ -45,6 +43,9 @@ from gsencoder.train.samples import (
     TrainingScene,
     join_samples,
 )
+
+if TYPE_CHECKING:
+    from gsencoder.train.rooms import RoomStream
 
 
 def encoder_trainer(
@@ -188,7 +189,9 @@ def prepare(
     """Prepares the scenes of a training in a folder, with this process's share of the cores."""
     heads = required_heads(config.heads, config.teachers_by_name)
     if config.rooms.libraries:
-        config.rooms.models()  # What cannot be read is an error before hours of preparation.
+        from gsencoder.train.rooms import models_of
+
+        models_of(config.rooms)  # What cannot be read is an error before hours of preparation.
     place: dict[str, Any] = {"process": process, "device": device, "track": track}
     with threads_of_torch(cpu_share(process, config.prepare_threads)):
         return prepare_scenes(scenes, held_out, words, config, folder, voxel=config.model.voxel, heads=heads, **place)
@@ -265,8 +268,11 @@ def fit(
 
 def room_stream(
     outputs: OutputSpaces, words: Mapping[str, Words], config: TrainConfig, recipe: SampleRecipe
-) -> RoomStream:
+) -> "RoomStream":
     """The rooms that are made during a training, with the classes of its labels."""
+    from gsencoder.data.furnished.kinds import kinds
+    from gsencoder.train.rooms import RoomStream
+
     name = config.labels_teacher
     assert name is not None
     space, number = outputs[name], list(config.teachers_by_name).index(name)

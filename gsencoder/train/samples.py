@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from gsencoder.core.errors import InputError, error_prefix
+from gsencoder.core.errors import InputError, error_prefix, listed
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, join_plans
@@ -47,6 +47,28 @@ class SamplingConfig(CheckedConfig):
     rare_centers: float = option(
         0.8, "share of crops whose center is drawn evenly over target classes instead of over Gaussians", ge=0, le=1
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoomsConfig(CheckedConfig):
+    """Settings of the rooms that are made during a training."""
+
+    libraries: tuple[str, ...] = option(
+        (), "furniture libraries (.sh3f) for rooms that are made while the training runs; empty = no such rooms"
+    )
+    share: float = option(0.75, "share of the samples that is from these rooms where scenes are given, too", gt=0, le=1)
+    samples: int = option(64, "number of samples from each room", ge=1, le=1_000_000)
+    without: tuple[str, ...] = option(
+        (), "kinds that no room has, to judge an encoder on kinds that it never saw", names=True
+    )
+
+    def __post_init__(self) -> None:
+        CheckedConfig.__post_init__(self)
+        from gsencoder.data.furnished.kinds import kinds
+
+        unknown = [name for name in self.without if name not in kinds()]
+        if unknown:
+            raise InputError(f"rooms.without={unknown[0]}: no such kind; the kinds are {listed(list(kinds()), 8)}")
 
 
 def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras) -> Bool[np.ndarray, " N"]:

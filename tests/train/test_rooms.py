@@ -15,8 +15,8 @@ from gsencoder.train.loop import micro_batches
 from gsencoder.train.losses import LossConfig, TeacherRecipe
 from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.train.prepared import ClassBalance
-from gsencoder.train.rooms import RoomsConfig, RoomStream
-from gsencoder.train.samples import Augmentation, SampleDataset, SampleRecipe, SamplingConfig
+from gsencoder.train.rooms import RoomStream, models_of
+from gsencoder.train.samples import Augmentation, RoomsConfig, SampleDataset, SampleRecipe, SamplingConfig
 
 CODE_OF = {kind: number for number, kind in enumerate(kinds())}
 CODEBOOK = np.random.default_rng(0).normal(size=(len(CODE_OF), 6)).astype(np.float32)
@@ -101,8 +101,8 @@ def test_no_held_out_make_stands_in_a_room(tmp_path: Path) -> None:
 
 def test_kinds_may_be_left_out_whole_and_misspelled_ones_are_named(library: Path) -> None:
     config = RoomsConfig(libraries=(str(library),), without=("couch", "bed"))
-    every = {model.kind.name for model in RoomsConfig(libraries=(str(library),)).models()}
-    assert every - {model.kind.name for model in config.models()} == {"couch", "bed"}
+    every = {model.kind.name for model in models_of(RoomsConfig(libraries=(str(library),)))}
+    assert every - {model.kind.name for model in models_of(config)} == {"couch", "bed"}
     with pytest.raises(InputError, match=r"rooms\.without=cauch: no such kind; the kinds are"):
         RoomsConfig(without=("cauch",))
 

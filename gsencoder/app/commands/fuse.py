@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from gsencoder.core.process import Clock, Device
 from gsencoder.core.settings import option
 from gsencoder.data.orbits import CamerasOfSplat
 from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.basis import describe_basis, project_maps, sample_cells
@@ -42,9 +43,12 @@ from gsencoder.teachers.build import (
     stored_words,
     words_of,
 )
-from gsencoder.text.table import WORDS_FILE, save_text_table
+from gsencoder.text.table import WORDS_FILE, TextTable, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
+
+if TYPE_CHECKING:
+    from gsencoder.infer.encode import Encoder
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +70,11 @@ class FuseCommandConfig(SharedScenesConfig):
     basis: str = option(
         "", "weights in whose basis features are fused, as encoded ones are; empty = a basis of the scene"
     )
+    encoder: str = option(
+        "",
+        "weights of an encoder: each Gaussian has the features of the teacher or of the encoder, whichever are surer; "
+        "empty = the teacher's alone",
+    )
     device: Device = option("auto", "where maps are lifted, cuda or cpu; auto = cuda if torch sees a GPU")
     report: bool = option(False, "write report.html, a page with pictures and figures")
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -84,6 +93,8 @@ class FuseCommandConfig(SharedScenesConfig):
     def __post_init__(self) -> None:
         SharedScenesConfig.__post_init__(self)
         check_budget(self.budget, self.fusion, basis=bool(self.basis))
+        if self.encoder and (self.basis or self.budget.limits):
+            raise InputError("encoder: expected no basis= and no budget with it")
 
 
 def run(config: FuseCommandConfig, run: Run) -> None:
@@ -95,6 +106,7 @@ def run(config: FuseCommandConfig, run: Run) -> None:
         if config.teacher.name != "auto":
             words_once(config.teacher, config.text)  # What cannot be read is an error before any scene is.
             heads = config.teacher.read_heads(config.teacher.stored_heads, "teacher.heads")
+        encoder = load_encoder(config.encoder, config.device) if config.encoder else None
     outputs = load_output_spaces(config.basis, "basis") if config.basis else None
 
     def one(path: Path, out: Path, run: Run) -> None:
@@ -136,9 +148,13 @@ def run(config: FuseCommandConfig, run: Run) -> None:
             if budgeted is not None:
                 made = {"views": len(fusion.views), "rank": fusion.features.features.shape[1]}
                 run.report_choice(scene.name, made, predicted=budgeted.predicted, notes=budgeted.notes)
+            words = stored_words(teacher, chosen.words)
+            if encoder is not None:
+                with run.step("encode"):
+                    fusion, words = with_encoder(fusion, encoder, scene, run)
             with run.step("write"):
                 save_features(folder, scene, fusion.features, recipe(chosen.teacher, fusion.config))
-                if (words := stored_words(teacher, chosen.words)) is not None:
+                if words is not None:
                     save_text_table(folder / WORDS_FILE, words)
             add_figures(fusion, run)
             if basis is not None and scene.views is not None:
@@ -156,11 +172,40 @@ def run(config: FuseCommandConfig, run: Run) -> None:
         run.print(
             f"{out}: {figures['seen']:,} of {counted(figures['gaussians'], 'Gaussian')} have features, "
             f"{figures['channels']} channels ({describe_basis(figures, 'this scene')}), from "
-            f"{counted(figures['views'], 'view')}",
+            f"{counted(figures['views'], 'view')}"
+            + (f"; {figures['by_encoder']:.0%} of them are the encoder's" if encoder is not None else ""),
             *(f"{out}: {line}" for line in lines),
         )
 
     run.scenes(paths, "features", one)
+
+
+def load_encoder(weights: str, device: Device) -> "Encoder":
+    from gsencoder.infer.encode import Encoder  # with torch
+
+    return Encoder.load(weights, device)
+
+
+def with_encoder(fusion: Fusion, encoder: "Encoder", scene: Scene, run: Run) -> tuple[Fusion, TextTable]:
+    """The fusion with the encoder's features where they are surer, and the encoder's words."""
+    from gsencoder.infer.ensemble import surer_features
+
+    assert scene.gaussians is not None
+    text_encoder = fusion.features.space.text_encoder
+    name = next((name for name, each in encoder.tables.items() if each.space.text_encoder == text_encoder), None)
+    if name is None:
+        raise InputError(
+            f"encoder: has no words of {text_encoder or 'the teacher, which has none'}; give teacher= and text= of the "
+            "encoder's words"
+        )
+    words = encoder.tables[name]
+    encoded = encoder.encode(scene.gaussians, space=name, metres_per_unit=unit_of(scene, encoder.voxel))
+    features, by_encoder = surer_features(
+        fusion.features, encoded, words.encode(words.trained or words.names), words.mean
+    )
+    run.results["by_encoder"] = float(by_encoder.mean())
+    # Which words the encoder was trained on says nothing of the Gaussians that the teacher names.
+    return replace(fusion, features=features), replace(words, trained=None)
 
 
 def report_limits(folder: Path, scene: Scene, fused: BudgetFusion, config: FuseCommandConfig, run: Run) -> list[str]:
