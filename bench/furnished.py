@@ -105,7 +105,7 @@ def main() -> None:
         thing = np.array([bool(each) for each in asked])[labels.items]
         for title, rows in table.items():
             gaussians = replace(labels.gaussians, sh=RECOLORS[title](labels.gaussians.sh).astype(np.float32))
-            features = encoder.encode(gaussians, space=space)
+            features = encoder.encode(gaussians, space=space, up=np.array([0.0, 0.0, 1.0]))
             right = names_of(features, words) == codes
             rows["things"].append(float(right[thing].mean()))
             rows["structure"].append(float(right[structure[codes]].mean()))

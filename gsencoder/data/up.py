@@ -13,7 +13,8 @@ orientation of its Gaussians hardly: there planes through neighboring means say 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
+from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.enclosure import (
@@ -23,7 +24,7 @@ from gsencoder.data.enclosure import (
     surfaces_of_depth,
     surfaces_of_gaussians,
 )
-from gsencoder.types import Cameras, Scene
+from gsencoder.types import Cameras, Gaussians, Scene
 from gsencoder.types.orientation import upright_views
 
 ALIGNED = float(np.deg2rad(6.0))  # Width of the bell by which normals count as parallel or perpendicular; float32 stays
@@ -238,3 +239,46 @@ def _floor_area(
     area = np.bincount(slices.clip(0, count), lying, count + 1)
     fifth = count // 5
     return float(area[:fifth].max() - 0.5 * area[-fifth:].max())
+
+
+FLOOR_QUANTILE = 0.01
+"""Share of the Gaussians below the floor: strays, and what shows through windows."""
+FLOOR_SAMPLE = 50_000
+
+
+def upright_gaussians(
+    gaussians: Gaussians, up: Float[np.ndarray, "3"] | None, *, floor_of: Float32[np.ndarray, "M 3"] | None = None
+) -> Gaussians:
+    """The splat, with colors of degree 0, turned so that up is z, and moved so that the floor is at 0.
+
+    Args:
+        up: None = z.
+        floor_of: means of the scene that the Gaussians are a part of; None = they are all of it.
+    """
+    means = gaussians.means if floor_of is None else floor_of
+    axis = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, np.float64) / np.linalg.norm(up)
+    heights = means[:: max(1, len(means) // FLOOR_SAMPLE)].astype(np.float64) @ axis
+    if axis[2] < 1 - 1e-9:
+        matrix = Rotation.align_vectors([[0, 0, 1]], [axis])[0].as_matrix()
+        gaussians = turn(gaussians, matrix, 1.0)
+    shift = np.array([0, 0, np.quantile(heights, FLOOR_QUANTILE)], np.float32)
+    return replace(gaussians, means=gaussians.means - shift)
+
+
+def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float) -> Gaussians:
+    """The splat, with colors of degree 0, after x → scale · to_from · x, where `to_from` is a rotation, or one with a
+    mirror."""
+    mirrored = np.linalg.det(to_from) < 0
+    # A Gaussian looks the same mirrored through its center, so −M turns its axes as M does, and is a rotation.
+    rotation = Rotation.from_matrix(-to_from if mirrored else to_from)
+    # A product of quaternions is linear in each: those with 1, i, j and k make its matrix. For many Gaussians that is
+    # ten times faster than scipy's product with each.
+    units = Rotation.from_quat(np.eye(4), scalar_first=True)
+    quats = gaussians.quats @ (rotation * units).as_quat(scalar_first=True)
+    return Gaussians(
+        means=(gaussians.means.astype(np.float64) @ (scale * to_from.T)).astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=(gaussians.scales * np.float32(scale)).astype(np.float32),
+        opacities=gaussians.opacities,
+        sh=gaussians.sh,
+    )

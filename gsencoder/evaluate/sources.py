@@ -56,7 +56,7 @@ def encoder_source(encoder: Encoder, config: EncodeConfig = EncodeConfig(), spac
         assert scene.gaussians is not None
         start = time.perf_counter()
         unit = unit_of(scene, encoder.voxel)
-        features = encoder.encode(scene.gaussians, config, space=space, metres_per_unit=unit)
+        features = encoder.encode(scene.gaussians, config, space=space, metres_per_unit=unit, up=scene.up)
         return features, {"encode": time.perf_counter() - start}
 
     return source

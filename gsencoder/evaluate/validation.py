@@ -142,7 +142,7 @@ def validate_encoder(
         gaussians = scene.first.gaussians(np.arange(len(scene.first)))
         with error_prefix(f"scene {scene.name}"):
             unit = scene.first.metres_per_unit or 1.0
-            encoded = network.encode_spaces(gaussians, config, metres_per_unit=unit)
+            encoded = network.encode_spaces(gaussians, config, metres_per_unit=unit, up=scene.first.up)
         for (teacher, accuracy), part in zip(accuracies.items(), scene.parts, strict=True):
             if part is not None:
                 accuracy.add(part, encoded[teacher].features)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import write_bytes
@@ -21,6 +21,7 @@ from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import ahead
+from gsencoder.data.up import upright_gaussians
 from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
 from gsencoder.models.grid import cut_scene_curves
@@ -112,6 +113,7 @@ class Encoder:
         *,
         space: str | None = None,
         metres_per_unit: float = 1.0,
+        up: Float64[np.ndarray, "3"] | None = None,
         track: Track = untracked,
     ) -> GaussianFeatures:
         """Features of every Gaussian in one space, all with weight 1.
@@ -119,10 +121,12 @@ class Encoder:
         Args:
             space: name of a teacher or of its feature space; None = the only one.
             metres_per_unit: unit of length of the splat; the encoder's grid is in metres.
+            up: the direction that is up in the splat (`Scene.up`), which is turned so that it is z, with the floor at
+                0, as in training; None = the splat is taken as it is.
             track: wraps the loop over chunks to show progress.
         """
         teacher = self.outputs.resolve(space)
-        return self._encode(gaussians, [teacher], config, metres_per_unit, track)[teacher]
+        return self._encode(gaussians, [teacher], config, metres_per_unit, up, track)[teacher]
 
     def encode_spaces(
         self,
@@ -130,19 +134,28 @@ class Encoder:
         config: EncodeConfig = EncodeConfig(),
         *,
         metres_per_unit: float = 1.0,
+        up: Float64[np.ndarray, "3"] | None = None,
         track: Track = untracked,
     ) -> dict[str, GaussianFeatures]:
         """Features of every Gaussian in all spaces, by the names of their teachers; see `encode`."""
-        return self._encode(gaussians, list(self.spaces), config, metres_per_unit, track)
+        return self._encode(gaussians, list(self.spaces), config, metres_per_unit, up, track)
 
     def _encode(
-        self, gaussians: Gaussians, teachers: Sequence[str], config: EncodeConfig, metres_per_unit: float, track: Track
+        self,
+        gaussians: Gaussians,
+        teachers: Sequence[str],
+        config: EncodeConfig,
+        metres_per_unit: float,
+        up: Float64[np.ndarray, "3"] | None,
+        track: Track,
     ) -> dict[str, GaussianFeatures]:
         """Chunk by chunk. Each region is a scene of its own: its features do not depend on what else the splat
         holds."""
         check_unit(metres_per_unit, "metres_per_unit")
         if not len(gaussians):
             raise InputError("encode: the splat has no Gaussians")
+        if up is not None:
+            gaussians = upright_gaussians(gaussians, up)
         header, voxel = self.network.header, self.voxel / metres_per_unit
         run = self.network.runner(config.precision, config.device, voxel)
         regions = scene_regions(gaussians.means, voxel)

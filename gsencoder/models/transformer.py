@@ -428,9 +428,16 @@ def _make_blocks(config: TransformerConfig, channels: int, rates: list[float]) -
     return nn.ModuleList(Block(channels, heads, drop_path=rate) for rate in rates)
 
 
-Attribute = Literal["offset", "color", "opacity", "scale", "rotation"]
+Attribute = Literal["offset", "color", "opacity", "scale", "rotation", "height"]
 
-ATTRIBUTE_CHANNELS: dict[Attribute, int] = {"offset": 3, "color": 3, "opacity": 1, "scale": 3, "rotation": 6}
+ATTRIBUTE_CHANNELS: dict[Attribute, int] = {
+    "offset": 3,
+    "color": 3,
+    "opacity": 1,
+    "scale": 3,
+    "rotation": 6,
+    "height": 2,
+}
 
 MAX_ABS_LOG_SCALE = 12.0
 """Limit to which log-scales relative to the voxel are clamped: no useful Gaussian is smaller or larger than e^±12
@@ -457,7 +464,9 @@ def embed(
     offset: position of the center in its voxel, −1 to 1. color: degree-0 color, −1 for black to 1 for white, clamped to
     ±2. opacity: −1 to 1. scale: ¼ of log(scale / voxel), largest first. rotation: ¼ of the six distinct entries of
     R diag(log s − mean log s) Rᵀ, the off-diagonal ones times √2, so that distances between inputs are Frobenius
-    distances between matrices. The voxel, in world units, is a tensor in an exported graph, where it is an input.
+    distances between matrices. height: z above the floor in 50 voxels and in 5, less 1, clamped to ±2 and ±1; z must be
+    up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). The voxel, in world units, is a tensor in an
+    exported graph, where it is an input.
     """
     channels: list[Tensor] = []
     log_scales = torch.log(scales.double() / voxel).clamp(-MAX_ABS_LOG_SCALE, MAX_ABS_LOG_SCALE).to(means.dtype)
@@ -469,6 +478,10 @@ def embed(
             channels.append((2 * SH_C0 * sh_dc).clamp(-2, 2))
         elif name == "opacity":
             channels.append(2 * opacities.unsqueeze(1) - 1)
+        elif name == "height":
+            cells = means[:, 2:].double() / voxel
+            channels.append((cells / 50 - 1).clamp(-2, 2).to(means.dtype))
+            channels.append((cells / 5 - 1).clamp(-1, 1).to(means.dtype))
         elif name == "scale":
             channels.append(log_scales.sort(dim=1, descending=True).values / 4)
         else:

@@ -13,13 +13,14 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from gsencoder.core.errors import InputError, error_prefix, listed
 from gsencoder.core.settings import CheckedConfig, option
+from gsencoder.data.up import turn, upright_gaussians
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, join_plans
 from gsencoder.train.losses import TERMS, Batch, LossConfig, RenderRows, TeacherRecipe, TeacherTargets
@@ -178,7 +179,12 @@ class Augmentation:
     noise: float = 0.02  # standard deviation of the noise added to each Gaussian's color; white = 1
     recolor: float = 0.0  # probability that color channels are permuted, inverted or made gray, a third each
     spread: float = 0.15  # standard deviation of the logarithm of a common factor of scales, and of one for each axis
+    lift: float = 0.15  # probability that the floor is believed anywhere, up to FAR voxels from where it is
     fade: float = 0.3  # largest share of its opacity that a Gaussian loses
+
+
+FAR, NEAR_FLOOR = 70.0, 2.0
+"""Largest error of a floor that was not found, and the usual one of one that was, in voxels."""
 
 
 def augment(
@@ -187,20 +193,23 @@ def augment(
     config: Augmentation,
     *,
     voxel: float,
-    up: Float64[np.ndarray, "3"] | None = None,
 ) -> Gaussians:
-    """Applies random changes to a splat with colors of degree 0; row i of the result is Gaussian i. `drop` is applied
-    by `make_sample`, since it removes rows; the voxel, in world units, is the unit of `jitter`, and `up` the axis of
-    `turn`, None = that of z."""
-    axis = np.array([0.0, 0.0, 1.0]) if up is None else up / np.linalg.norm(up)
+    """Applies random changes to an upright splat with colors of degree 0; row i of the result is Gaussian i. `drop` is
+    applied by `make_sample`, since it removes rows; the voxel, in world units, is the unit of `jitter` and `lift`."""
+    axis = np.array([0.0, 0.0, 1.0])
     rotation = Rotation.from_rotvec(axis * math.radians(rng.uniform(-config.turn, config.turn)))
     horizontal = Rotation.from_rotvec(axis * rng.uniform(0, 2 * math.pi)).apply(perpendicular(axis))
     rotation = Rotation.from_rotvec(horizontal * math.radians(rng.normal(0, config.tilt))) * rotation
     to_from = rotation.as_matrix()
     if rng.random() < config.mirror:
         to_from = to_from @ (np.eye(3) - 2 * np.outer(horizontal, horizontal))
-    turned = turn(gaussians, to_from, float(rng.uniform(1 - config.scale, 1 + config.scale)))
-    shift = rng.uniform(0, voxel, 3) + rng.normal(0, config.jitter * voxel, turned.means.shape)
+    # About the middle of the floor below it, so that a tilt does not lift it.
+    middle = np.append(gaussians.means[:, :2].mean(axis=0), np.float32(0))
+    centered = replace(gaussians, means=gaussians.means - middle)
+    turned = turn(centered, to_from, float(rng.uniform(1 - config.scale, 1 + config.scale)))
+    shift = middle + rng.uniform(0, voxel, 3) + rng.normal(0, config.jitter * voxel, turned.means.shape)
+    if config.lift:
+        shift[:, 2] += voxel * (rng.uniform(-FAR, FAR) if rng.random() < config.lift else rng.normal(0, NEAR_FLOOR))
     # Colors are ½ + SH_C0·dc.
     gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
     black_shift = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
@@ -231,25 +240,6 @@ def _recolored(
     changed = -sh if change == 1 else sh[:, :, rng.permutation(3)]
     gray = changed.mean(axis=2, keepdims=True)
     return gray + (changed - gray) * rng.uniform(0.3, 1.5)
-
-
-def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float) -> Gaussians:
-    """The splat, with colors of degree 0, after x → scale · to_from · x, where `to_from` is a rotation, or one with a
-    mirror."""
-    mirrored = np.linalg.det(to_from) < 0
-    # A Gaussian looks the same mirrored through its center, so −M turns its axes as M does, and is a rotation.
-    rotation = Rotation.from_matrix(-to_from if mirrored else to_from)
-    # A product of quaternions is linear in each: those with 1, i, j and k make its matrix. For many Gaussians that is
-    # ten times faster than scipy's product with each.
-    units = Rotation.from_quat(np.eye(4), scalar_first=True)
-    quats = gaussians.quats @ (rotation * units).as_quat(scalar_first=True)
-    return Gaussians(
-        means=(gaussians.means.astype(np.float64) @ (scale * to_from.T)).astype(np.float32),
-        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
-        scales=(gaussians.scales * np.float32(scale)).astype(np.float32),
-        opacities=gaussians.opacities,
-        sh=gaussians.sh,
-    )
 
 
 MIN_REMAINING_WEIGHT = 0.5
@@ -545,9 +535,9 @@ def make_sample(
     augmentation = recipe.augmentation
     remaining = drop_random(selected, augmentation.drop, rng) if augmentation is not None else selected
     voxel = recipe.encoder.voxel / (source.metres_per_unit or 1.0)
-    gaussians = source.gaussians(remaining)
+    gaussians = upright_gaussians(source.gaussians(remaining), source.up, floor_of=source.means)
     if augmentation is not None:
-        gaussians = augment(gaussians, rng, augmentation, voxel=voxel, up=source.up)
+        gaussians = augment(gaussians, rng, augmentation, voxel=voxel)
     attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
     return Sample(
         name=f"{scene.name} ({', '.join(source.view_names[view] for view in views)})",

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from field_scenes import FieldRoom, cam_from_world, store_turned, write_colmap_text, write_transforms
 from PIL import Image, ImageOps
 from scene_files import photograph
 from scipy.spatial.transform import Rotation
-from splats import front_camera, gaussians_at
+from splats import front_camera, gaussians_at, random_gaussians
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.core.errors import InputError, SceneWarning
@@ -18,10 +19,21 @@ from gsencoder.data.enclosure import Surfaces, surfaces_of_gaussians
 from gsencoder.data.readers.images import picture_info, read_rgba
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic import make_room
-from gsencoder.data.up import Up, _floor_area, _refine, _support, estimate_up, up_of_cameras, up_of_scene, with_up
+from gsencoder.data.up import (
+    Up,
+    _floor_area,
+    _refine,
+    _support,
+    estimate_up,
+    up_of_cameras,
+    up_of_scene,
+    upright_gaussians,
+    with_up,
+)
 from gsencoder.fusion.checkpoint import upright
 from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.fuse import FuseConfig, fuse
+from gsencoder.geometry import covariances
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.pictures import view_pictures
@@ -429,3 +441,23 @@ def test_views_for_people_and_models_are_upright(field_room, tmp_path):
             assert np.array_equal(picture, np.asarray(ImageOps.exif_transpose(stored)))
     rendered, _ = view_pictures(loaded, choose_views(loaded, [], config))
     assert all(np.abs(each.astype(int) - picture).mean() < 25 for each, picture in zip(rendered, pictures, strict=True))
+
+
+@pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (0.3, -0.5, 0.8)])
+def test_an_upright_splat_has_its_floor_at_zero_whichever_way_up_was(up: tuple[float, float, float] | None) -> None:
+    one = random_gaussians(400, center=(0, 0, 0))
+    axis = np.array((0.0, 0.0, 1.0) if up is None else up) / np.linalg.norm((0.0, 0.0, 1.0) if up is None else up)
+    standing = upright_gaussians(one, None if up is None else np.array(up))
+    heights = one.means.astype(np.float64) @ axis
+    np.testing.assert_allclose(standing.means[:, 2], heights - np.quantile(heights, 0.01), atol=1e-4)
+    distances = np.linalg.norm(one.means[:, None] - one.means[None], axis=-1)
+    np.testing.assert_allclose(
+        np.linalg.norm(standing.means[:, None] - standing.means[None], axis=-1), distances, atol=1e-3
+    )
+    part = upright_gaussians(one.select(np.arange(7)), None if up is None else np.array(up), floor_of=one.means)
+    np.testing.assert_allclose(part.means, standing.means[:7], atol=1e-5)
+    before, after = (
+        covariances(torch.from_numpy(each.quats), torch.from_numpy(each.scales)).numpy() for each in (one, standing)
+    )
+    lengths = np.einsum("i,nij,j->n", axis, before, axis)
+    np.testing.assert_allclose(after[:, 2, 2], lengths, rtol=1e-3, atol=1e-6)

@@ -17,6 +17,7 @@ from splats import front_camera, random_gaussians
 from training_scenes import LOSSES, SMALL, samples, small_encoder
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.up import turn
 from gsencoder.geometry import covariances
 from gsencoder.render import BlendConfig, blend
 from gsencoder.train import samples as module
@@ -38,7 +39,6 @@ from gsencoder.train.samples import (
     nearest_rows,
     restrict_rows,
     target_codes,
-    turn,
 )
 from gsencoder.types import SH_C0, Cameras, Gaussians
 
@@ -430,6 +430,7 @@ NOTHING = Augmentation(
     tint=0.0,
     noise=0.0,
     spread=0.0,
+    lift=0.0,
     fade=0.0,
 )
 
@@ -465,11 +466,13 @@ def test_with_every_amount_at_zero_nothing_changes_but_the_place_on_the_grid() -
     assert (shift <= 0.02 + 1e-6).all()
 
 
-def test_up_stays_up_but_for_the_tilt() -> None:
-    up = np.array([0.0, 0.6, 0.8])
-    one = replace(splat(), means=np.stack([(i * up).astype(np.float32) for i in range(30)]))
-    turned = augment(one, np.random.default_rng(3), replace(NOTHING, turn=180.0, mirror=1.0), voxel=0.0, up=up)
-    np.testing.assert_allclose(turned.means, one.means, atol=1e-4)
+def test_heights_stay_but_for_the_tilt_and_a_floor_that_is_not_found() -> None:
+    one = replace(splat(), means=splat().means + np.array([5, 2, 1], np.float32))
+    turned = augment(one, np.random.default_rng(3), replace(NOTHING, turn=180.0, mirror=1.0), voxel=0.0)
+    np.testing.assert_allclose(turned.means[:, 2], one.means[:, 2], atol=1e-4)
+    moved = augment(one, np.random.default_rng(3), replace(NOTHING, lift=1.0), voxel=0.02)
+    assert np.ptp(moved.means[:, 2] - one.means[:, 2]) < 1e-4
+    assert abs(float(moved.means[0, 2] - one.means[0, 2])) > 0.1
 
 
 def test_light_changes_brightness_and_black_stays_near_black() -> None:

@@ -21,7 +21,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
-from gsencoder.data.up import with_up
+from gsencoder.data.up import upright_gaussians, with_up
 from gsencoder.fusion.basis import basis_figures, describe_basis, project_maps
 from gsencoder.fusion.folder import FEATURES_FILE, save_features
 from gsencoder.infer.encode import EncodeConfig, Encoder, file_of_encoder
@@ -137,13 +137,15 @@ def _encode_into(
     """Encodes a scene and writes its features and words; returns the spaces written, and a line for each limit."""
     assert scene.gaussians is not None
     unit, budget = unit_of(scene, encoder.voxel), config.budget
+    # Without a known up, as it is: z may or may not be up then.
+    gaussians = scene.gaussians if scene.up is None else upright_gaussians(scene.gaussians, scene.up)
     teachers = requested_teachers(encoder, config.spaces)
     budgeted: BudgetEncoding | None = None
     if budget.limits:
         # Of the settings, those that take the most bytes in the files.
         longest = replace(exact_encoding(config.encode), precision="bfloat16")
         budgeted = encode_within(
-            scene.gaussians,
+            gaussians,
             encoder,
             teachers,
             config.encode,
@@ -159,7 +161,7 @@ def _encode_into(
         run.report_choice(scene.name, chosen, predicted=budgeted.predicted, notes=budgeted.notes)
     else:
         with run.step("encode"):
-            by_teacher = encoder.encode_spaces(scene.gaussians, config.encode, metres_per_unit=unit, track=run.track)
+            by_teacher = encoder.encode_spaces(gaussians, config.encode, metres_per_unit=unit, track=run.track)
         by_teacher, encoding = {name: by_teacher[name] for name in teachers}, config.encode
     if config.basis_views and all(each.basis is None for each in by_teacher.values()):
         raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
@@ -183,7 +185,7 @@ def _encode_into(
         measured = {"seconds": budgeted.seconds, "megabytes": sum(sizes) / MEGABYTE}
         if budget.error is not None and budget.check:
             with run.step("check"):
-                errors = realised_error(budgeted, scene.gaussians, encoder, metres_per_unit=unit, track=run.track)
+                errors = realised_error(budgeted, gaussians, encoder, metres_per_unit=unit, track=run.track)
             measured["error"] = max(error.total for error in errors.values())
         lines = run.report_budget(budget, measured)
     first = next(iter(by_teacher.values()))

@@ -356,7 +356,7 @@ def open_encoder(inputs: Inputs, path: Path) -> Iterator[Opened]:
             config = replace(config, precision="auto")
         encoder = encoder_of(*shape) if settings.graph == "none" else graph_of(*shape, settings.graph)
         space, unit = labels_of(settings.weights)[0], unit_of(scene, encoder.voxel)
-        return encoder.encode(gaussians, config, space=space, metres_per_unit=unit)
+        return encoder.encode(gaussians, config, space=space, metres_per_unit=unit, up=scene.up)
 
     @lru_cache
     def reference_of(weights: str) -> GaussianFeatures:
