@@ -21,7 +21,7 @@ def main(folder: str, words: str) -> None:
 
     # The network sees means, rotations, scales, opacities and colors of the Gaussians, in metres.
     encoder = Encoder.load("house_cpu")
-    features = encoder.encode(scene.gaussians, metres_per_unit=scene.metres_per_unit or 1.0)
+    features = encoder.encode(scene.gaussians, metres_per_unit=scene.metres_per_unit or 1.0, up=scene.up)
     print(f"{len(features):,} features of {features.space.describe()}")
 
     # It knows the names that it was trained on; the words lie beside the weights.

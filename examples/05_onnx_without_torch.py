@@ -14,7 +14,7 @@ def main(model: str, splat: str, word: str) -> None:
     if encoder.words is None:
         raise InputError(f"{model} holds no words")
     gaussians = load_splat(splat)
-    features = encoder.encode(gaussians)  # of a splat in metres; else give metres_per_unit=
+    features = encoder.encode(gaussians)  # of a splat in metres, z up; else give metres_per_unit=, up=
     scene = Scene(name="scene", gaussians=gaussians, features={features.space.name: features})
     for box in localize(scene, [word], encoder.words).boxes[:3]:  # best first
         size = " × ".join(f"{side:.2f}" for side in box.aabb_max - box.aabb_min)
