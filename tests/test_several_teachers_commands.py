@@ -80,7 +80,7 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_named(rooms, t
     scene = load_features(encoded)
     assert set(scene.features) == {"labels", "palette"}
     assert set(results_of(encoded)["teachers"]) == {"labels", "palette"}
-    direct = Encoder.load(str(trained)).encode_spaces(scene.gaussians, metres_per_unit=1.0)
+    direct = Encoder.load(str(trained)).encode_spaces(scene.gaussians, metres_per_unit=1.0, up=scene.up)
     for name, features in direct.items():
         np.testing.assert_allclose(scene.features[name].features, features.features, atol=5e-3)
     words = ["encode", str(rooms / "room_2"), f"weights={trained}", "quiet=true"]

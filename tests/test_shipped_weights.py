@@ -66,7 +66,9 @@ def test_those_of_several_teachers_have_the_settings_of_their_experiment() -> No
         if name not in CHANGEABLE_ON_RESUME:
             assert value == {**constants, **settings["train"]}[name], name
     assert settings["augment"]
-    assert made_with["augment"] == asdict(Augmentation())
+    # These were added since.
+    later = {"recolor", "spread", "lift", "fade"}
+    assert made_with["augment"] == {name: value for name, value in asdict(Augmentation()).items() if name not in later}
 
 
 def unseen_room(shared: Path, number: int, *, views: int) -> Scene:

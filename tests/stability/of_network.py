@@ -87,6 +87,8 @@ def embed_error(case: Case) -> float:
         2 * g.opacities.astype(Wide)[:, None] - 1,
         -np.sort(-logs, axis=1) / 4,
         np.stack(entries, axis=1),
+        np.clip(cells[:, 2:] / 50 - 1, -2, 2),
+        np.clip(cells[:, 2:] / 5 - 1, -1, 1),
     ]
     return worst(got, np.concatenate(want, axis=1), 1)
 
