@@ -46,7 +46,13 @@ class SamplingConfig(CheckedConfig):
         4_000, "smallest size of a crop; sizes are log-uniform up to `gaussians`; 0 = all of that size", ge=0
     )
     rare_centers: float = option(
-        0.8, "share of crops whose center is drawn evenly over target classes instead of over Gaussians", ge=0, le=1
+        0.8, "share of crops whose center is drawn by target classes instead of evenly over Gaussians", ge=0, le=1
+    )
+    center_power: float = option(
+        1.0,
+        "power p of the weights n^−p by which these centers are drawn; 1 = classes evenly, 0 = Gaussians",
+        ge=0,
+        le=2,
     )
 
 
@@ -528,9 +534,8 @@ def make_sample(
     """Makes a sample: selects views and Gaussians of a scene, augments them and computes the encoder's inputs. Its
     `size` is the largest number of Gaussians; 0 = all that the views see."""
     source = scene.first
-    # With the power 1 every class is equally often the center of a crop.
     first, first_codes = next((number, each) for number, each in enumerate(codes) if each is not None)
-    center_weights = _weights_of(first_codes, recipe.teachers[first].class_balance, 1.0)
+    center_weights = _weights_of(first_codes, recipe.teachers[first].class_balance, recipe.sampling.center_power)
     views, selected = choose_crop(source.means, source.cameras, center_weights, recipe.sampling, size, rng)
     augmentation = recipe.augmentation
     remaining = drop_random(selected, augmentation.drop, rng) if augmentation is not None else selected
