@@ -24,7 +24,7 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.data.furnished.kinds import STRUCTURE, kinds
 from gsencoder.data.furnished.library import held_out_models, load_libraries, select_makes
 from gsencoder.data.furnished.plan import plan_home
-from gsencoder.data.furnished.walk import LabeledSplat, WalkConfig, furnished_splat
+from gsencoder.data.furnished.walk import LabeledSplat, furnished_splat, splat_walk
 from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.infer.encode import Encoder
 from gsencoder.infer.localize import localize, spacing_of
@@ -97,9 +97,7 @@ def main() -> None:
     for number in range(arguments.rooms):
         rng = np.random.default_rng([arguments.seed, number])
         home = plan_home(models, rng)
-        area = sum(floor.size for _, floor, _ in home.rooms)
-        walk = WalkConfig(views=int(min(90, 14 + 1.3 * area)), width=160)
-        labels = furnished_splat(home, walk, VOXEL, rng)
+        labels = furnished_splat(home, splat_walk(home), VOXEL, rng)
         codes = np.array([names.index(item.kind) for item in home.items])[labels.items]
         asked = [item.kind if item.kind in scored else "" for item in home.items]
         thing = np.array([bool(each) for each in asked])[labels.items]

@@ -15,7 +15,7 @@ from jaxtyping import Float16, Float32, Float64, Int32
 from gsencoder.core.process import Track, untracked
 from gsencoder.data.furnished.library import Model, load_libraries, select_makes
 from gsencoder.data.furnished.plan import plan_home
-from gsencoder.data.furnished.walk import LabeledSplat, WalkConfig, furnished_splat
+from gsencoder.data.furnished.walk import LabeledSplat, furnished_splat, splat_walk
 from gsencoder.train.losses import TeacherRecipe
 from gsencoder.train.prepared import ScenePart, ViewRows
 from gsencoder.train.samples import Codes, RoomsConfig, TrainingScene
@@ -25,13 +25,8 @@ SLOTS = 16
 """Smallest number of rooms from which samples are drawn in turn."""
 COUNTED = 24
 """Number of rooms in which labels are counted, to weight rare ones."""
-VIEWS_PER_AREA = 1.3
-"""Views of a walk for each square metre of floor, beyond `FIRST_VIEWS`; they see most of what stands there."""
-FIRST_VIEWS, MAX_VIEWS = 14, 90
 DENSITIES = (0.6, 1.4)
 """Smallest and largest distance of the seeds, in voxels of the encoder."""
-VIEW_WIDTH = 160
-"""Width of the views, pixels: enough for a depth in each cell of 2 cm at 3 m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,13 +145,7 @@ class RoomStream:
     def labeled_part(self, rng: np.random.Generator, name: str) -> LabeledPart:
         """Makes a room, seen on a walk with a sensor of random quality, with seeds of random density."""
         home = plan_home(self._models, rng)
-        area = sum((floor.x1 - floor.x0) * (floor.y1 - floor.y0) for _, floor, _ in home.rooms)
-        walk = WalkConfig(
-            views=int(min(MAX_VIEWS, FIRST_VIEWS + VIEWS_PER_AREA * area)),
-            width=VIEW_WIDTH,
-            noise=float(rng.uniform(0.2, 1.5)),
-            drift=float(rng.uniform(0, 0.02)),
-        )
+        walk = splat_walk(home, noise=float(rng.uniform(0.2, 1.5)), drift=float(rng.uniform(0, 0.02)))
         splat = furnished_splat(home, walk, float(rng.uniform(*DENSITIES)) * self._voxel, rng)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
         return LabeledPart(name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook)

@@ -24,8 +24,8 @@ CODEBOOK = np.random.default_rng(0).normal(size=(len(CODE_OF), 6)).astype(np.flo
 
 @pytest.fixture(autouse=True)
 def _short_walks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("MAX_VIEWS", 4), ("COUNTED", 4), ("SLOTS", 4)):
-        monkeypatch.setattr(f"gsencoder.train.rooms.{name}", value)
+    for name, value in (("data.furnished.walk.MAX_VIEWS", 4), ("train.rooms.COUNTED", 4), ("train.rooms.SLOTS", 4)):
+        monkeypatch.setattr(f"gsencoder.{name}", value)
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from gsencoder.data.furnished.surfaces import Surfaces
 from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.seeding.depth import SurfaceGrid
-from gsencoder.data.seeding.points import OPACITY, SIZE, THICKNESS, quats_from_normals
-from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views, sh_from_colors
+from gsencoder.data.seeding.points import flat_gaussians
+from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views
 
 CLEARANCE = 0.25
 """Smallest distance of the camera from a surface, metres."""
@@ -31,6 +31,20 @@ class WalkConfig(CheckedConfig):
     width: int = option(320, "width of the views in pixels; the height is three quarters of it", ge=16, le=8192)
     noise: float = option(1.0, "noise of the depth sensor, as a multiple of a structured-light camera's", ge=0, le=100)
     drift: float = option(0.01, "largest error of a pose, metres; poses drift along the walk", ge=0, le=1)
+
+
+VIEWS_PER_AREA = 1.3
+"""Views of a splat's walk for each square metre of floor, beyond `FIRST_VIEWS`; they see most of what stands there."""
+FIRST_VIEWS, MAX_VIEWS = 14, 90
+VIEW_WIDTH = 160
+"""Width of these views, pixels: enough for a depth in each cell of 2 cm at 3 m."""
+
+
+def splat_walk(home: Home, *, noise: float = 1.0, drift: float = 0.01) -> WalkConfig:
+    """A walk from which a splat of a home is made: views by the area of its floor."""
+    area = sum(floor.size for _, floor, _ in home.rooms)
+    views = int(min(MAX_VIEWS, FIRST_VIEWS + VIEWS_PER_AREA * area))
+    return WalkConfig(views=views, width=VIEW_WIDTH, noise=noise, drift=drift)
 
 
 class Frame(NamedTuple):
@@ -172,15 +186,7 @@ def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random
     if not len(samples.points):
         raise InputError("furnished: the walk sees nothing")
     items = _commonest(np.concatenate(keys), len(home.items), _voxel_keys(samples.points, voxel))
-    # Samples of one grid are about a voxel apart, so that spacings need not be measured.
-    size = np.full((len(items), 1), SIZE * voxel, np.float32)
-    gaussians = Gaussians(
-        means=samples.points,
-        quats=quats_from_normals(samples.normals),
-        scales=size * np.array([1, 1, THICKNESS], np.float32),
-        opacities=np.full(len(items), OPACITY, np.float32),
-        sh=sh_from_colors(samples.colors),
-    )
+    gaussians = flat_gaussians(samples.points, samples.normals, samples.colors, largest=voxel, measured=False)
     return LabeledSplat(gaussians, items, believed)
 
 

@@ -34,14 +34,17 @@ def flat_gaussians(
     *,
     largest: float | Float32[np.ndarray, " n"],
     thickness: float | Float32[np.ndarray, " n"] = THICKNESS,
+    measured: bool = True,
 ) -> Gaussians:
     """One Gaussian a point, flat along its normal, SH degree 0, opacity 0.95.
 
     Args:
         largest: upper limit of the spacing, which also holds where there is no neighbor.
         thickness: standard deviation along the normal as a share of the in-plane one.
+        measured: False = the spacing is `largest` everywhere, as that of samples of a grid nearly is.
     """
-    size = (SIZE * surface_spacing(points, normals, largest)).astype(np.float32)
+    spacing = surface_spacing(points, normals, largest) if measured else np.broadcast_to(largest, len(points))
+    size = (SIZE * spacing).astype(np.float32)
     scales = np.stack([size, size, size * thickness], axis=1).astype(np.float32)
     return Gaussians(
         means=points,
