@@ -13,7 +13,7 @@ import argparse
 import json
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from errors import one_line_errors, positive
 
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.furnished.kinds import STRUCTURE, kinds
-from gsencoder.data.furnished.library import held_out_models, load_libraries, select_makes
+from gsencoder.data.furnished.library import Model, held_out_models, load_libraries, select_makes
 from gsencoder.data.furnished.plan import plan_home
 from gsencoder.data.furnished.walk import LabeledSplat, furnished_splat, splat_walk
 from gsencoder.evaluate.benchmarks.localization import aabb_iou
@@ -41,6 +41,16 @@ RECOLORS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "gray": lambda sh: np.repeat(sh.mean(axis=2, keepdims=True), 3, axis=2),
     "inverted": lambda sh: -sh,
 }
+
+
+def made_homes(models: Sequence[Model], seed: int, count: int) -> Iterator[tuple[LabeledSplat, np.ndarray, list[str]]]:
+    """Homes of these models: the Gaussians with their items, their kinds, and the kind of each item."""
+    for number in range(count):
+        rng = np.random.default_rng([seed, number])
+        home = plan_home(models, rng)
+        labels = furnished_splat(home, splat_walk(home), VOXEL, rng)
+        of_items = [item.kind for item in home.items]
+        yield labels, np.array([list(kinds()).index(kind) for kind in of_items])[labels.items], of_items
 
 
 def names_of(features: GaussianFeatures, words: TextTable) -> np.ndarray:
@@ -94,12 +104,8 @@ def main() -> None:
     structure = np.array([name in STRUCTURE for name in names])
     table: dict[str, dict[str, list[float]]] = {each: defaultdict(list) for each in arguments.recolor or ["as it is"]}
     of_kind: dict[str, list[float]] = defaultdict(lambda: [0, 0])
-    for number in range(arguments.rooms):
-        rng = np.random.default_rng([arguments.seed, number])
-        home = plan_home(models, rng)
-        labels = furnished_splat(home, splat_walk(home), VOXEL, rng)
-        codes = np.array([names.index(item.kind) for item in home.items])[labels.items]
-        asked = [item.kind if item.kind in scored else "" for item in home.items]
+    for number, (labels, codes, of_items) in enumerate(made_homes(models, arguments.seed, arguments.rooms)):
+        asked = [kind if kind in scored else "" for kind in of_items]
         thing = np.array([bool(each) for each in asked])[labels.items]
         for title, rows in table.items():
             gaussians = replace(labels.gaussians, sh=RECOLORS[title](labels.gaussians.sh).astype(np.float32))

@@ -25,6 +25,8 @@ SLOTS = 16
 """Smallest number of rooms from which samples are drawn in turn."""
 COUNTED = 24
 """Number of rooms in which labels are counted, to weight rare ones."""
+STORED = 0.5
+"""Share of storage rooms, in which things of all kinds are as frequent, among homes."""
 DENSITIES = (0.6, 1.4)
 """Smallest and largest distance of the seeds, in voxels of the encoder."""
 
@@ -144,7 +146,7 @@ class RoomStream:
 
     def labeled_part(self, rng: np.random.Generator, name: str) -> LabeledPart:
         """Makes a room, seen on a walk with a sensor of random quality, with seeds of random density."""
-        home = plan_home(self._models, rng)
+        home = plan_home(self._models, rng, ("storage room",) if rng.random() < STORED else ())
         walk = splat_walk(home, noise=float(rng.uniform(0.2, 1.5)), drift=float(rng.uniform(0, 0.02)))
         splat = furnished_splat(home, walk, float(rng.uniform(*DENSITIES)) * self._voxel, rng)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)

@@ -94,7 +94,8 @@ def nearest_rows(
     """The `count` rows nearest to a point, in ascending order; all rows if there are not more."""
     if len(means) <= count:
         return np.arange(len(means))
-    distances = np.square(means - center).sum(axis=1)
+    offsets = means - center
+    distances = np.einsum("nc,nc->n", offsets, offsets)
     return np.sort(np.argpartition(distances, count)[:count])
 
 

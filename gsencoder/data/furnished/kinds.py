@@ -12,7 +12,7 @@ from typing import Literal, cast, get_args
 Place = Literal["wall", "free", "mounted", "ceiling", "surface", "floor", "opening"]
 """With its back to a wall, anywhere on the floor, on a wall, under the ceiling, on furniture, flat on the floor, or in
 an opening of a wall."""
-RoomType = Literal["bedroom", "living room", "kitchen", "bathroom", "office", "corridor"]
+RoomType = Literal["bedroom", "living room", "kitchen", "bathroom", "office", "corridor", "storage room"]
 ROOM_TYPES: tuple[RoomType, ...] = get_args(RoomType)
 STRUCTURE = ("wall", "floor", "ceiling")
 """The kinds that enclose a room; all others are things."""

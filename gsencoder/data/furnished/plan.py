@@ -29,8 +29,11 @@ _AREAS: dict[RoomType, tuple[float, float]] = {
     "bathroom": (4, 10),
     "office": (9, 28),
     "corridor": (4, 9),
+    "storage room": (14, 28),
 }
-_FREQUENCIES = (0.24, 0.26, 0.18, 0.12, 0.16, 0.04)
+_FREQUENCIES = (0.24, 0.26, 0.18, 0.12, 0.16, 0.04, 0.0)
+"""Of the types of rooms in homes; storage rooms, which hold things of all kinds alike and have no walls, are made where
+they are asked for."""
 _EXTRAS: dict[RoomType, tuple[float, float]] = {
     "bedroom": (3, 9),
     "living room": (4, 12),
@@ -38,6 +41,7 @@ _EXTRAS: dict[RoomType, tuple[float, float]] = {
     "bathroom": (3, 8),
     "office": (3, 9),
     "corridor": (1, 4),
+    "storage room": (60, 100),
 }
 """Single things on floor, walls and ceiling, in addition to groups."""
 
@@ -195,7 +199,8 @@ class _Furnisher:
 
     def furnish(self) -> None:
         """Openings and what encloses the room, groups, single things, small things."""
-        self._doors_and_windows()
+        if self.room.type != "storage room":
+            self._doors_and_windows()
         groups: dict[RoomType, Sequence[Callable[[], object]]] = {
             "bedroom": (self._bed, self._bed_or_desk, partial(self._wall, "wardrobe")),
             "living room": (self._seats, self._dining, partial(self._wall, "bookshelf")),
@@ -203,6 +208,7 @@ class _Furnisher:
             "bathroom": tuple(partial(self._wall, kind) for kind in ("toilet", "sink", "bathtub")),
             "office": (self._desk, self._desk, self._desk, partial(self._wall, "bookshelf")),
             "corridor": (),
+            "storage room": (),
         }
         for group in groups[self.room.type]:
             if self.rng.random() < 0.85:
@@ -513,7 +519,7 @@ class _Furnisher:
         """The kinds with models that this room may have at some places, and how often."""
         names, weights = [], []
         for name, kind in kinds().items():
-            frequency = kind.rooms.get(self.room.type, 0.0)
+            frequency = 1.0 if self.room.type == "storage room" else kind.rooms.get(self.room.type, 0.0)
             if kind.place in places and frequency > 0 and self.models.get(name):
                 names.append(name)
                 weights.append(frequency)
@@ -521,13 +527,14 @@ class _Furnisher:
         return names, total / max(total.sum(), 1e-9)
 
     def _extras(self) -> None:
-        names, weights = self._weights(("wall", "free", "mounted", "ceiling", "floor"))
+        stored = self.room.type == "storage room"
+        names, weights = self._weights(("wall", "free", "mounted", "ceiling", "floor", *(["surface"] * stored)))
         area = self.room.area.size
         lower, upper = _EXTRAS[self.room.type]
         count = round(float(self.rng.uniform(lower, upper)) * min(2.0, max(0.5, area / 14)))
         for name in self.rng.choice(names, count, p=weights).tolist() if names else ():
             place = kinds()[name].place
-            if place in ("wall", "mounted"):
+            if place == "mounted" or (place == "wall" and not (stored and self.rng.random() < 0.5)):
                 self._wall(name)
             else:
                 self._anywhere(name)
@@ -671,7 +678,8 @@ class _Furnisher:
         """Walls with their openings, floor and ceiling."""
         walls, floor, ceiling = panels(self.room.area, self.room.height, self.room.openings, THICKNESS)
         identity = pose(0.0, 0.0, 0.0, 0.0, np.ones(3))
-        for kind, shape in (("wall", walls), ("floor", floor), ("ceiling", ceiling)):
+        around = (("wall", walls), ("ceiling", ceiling)) if self.room.type != "storage room" else ()
+        for kind, shape in (("floor", floor), *around):
             self.room.items.append(Item(kind=kind, matrix=identity, shape=shape, finish=kind))
 
 
