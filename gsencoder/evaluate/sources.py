@@ -250,7 +250,7 @@ def class_cosines(
         if len(rows):
             means[number] = features.stored(rows).mean(axis=0, dtype=np.float64)
     # A mean of coordinates is the coordinates of the mean.
-    of_sets = replace(features, features=means, weights=counts, index=None)
+    of_sets = replace(features, features=means, weights=counts, index=None, confidence=None)
     return relevancy(of_sets, text.encode(list(names)), text.mean).T
 
 

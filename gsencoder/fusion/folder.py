@@ -194,6 +194,7 @@ def _write_rows(path: Path, features: GaussianFeatures, settings: Mapping[str, A
         halves=halves,
         channel_scale=channel_scale,
         weights=features.weights[rows],
+        confidence=None if features.confidence is None else features.confidence[rows].astype(np.float16),
         settings=settings,
         fingerprint=fingerprint,
     )
@@ -209,20 +210,29 @@ def _contents(
     halves: Float16[np.ndarray, "n channels"],
     channel_scale: Float32[np.ndarray, " channels"],
     weights: Float32[np.ndarray, " n"],
+    confidence: Float16[np.ndarray, " n"] | None,
     settings: Mapping[str, Any],
     fingerprint: str,
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the header of a file of features of the seen rows."""
     arrays, header = space_parts(space, mean, basis)
     arrays |= {"rows": rows, "features": halves, "channel_scale": channel_scale, "weights": weights}
+    if confidence is not None:
+        arrays["confidence"] = confidence
     return arrays, header | {"settings": dict(settings), "fingerprint": fingerprint}
 
 
 def features_bytes(
-    space: FeatureSpace, rows: int, rank: int, settings: Mapping[str, Any] = {}, *, basis: bool = True
+    space: FeatureSpace,
+    rows: int,
+    rank: int,
+    settings: Mapping[str, Any] = {},
+    *,
+    basis: bool = True,
+    confidence: bool = False,
 ) -> int:
-    """The size of the file that `save_features` would write for a number of seen Gaussians; `basis` is whether the
-    coordinates are in one."""
+    """The size of the file that `save_features` would write for a number of seen Gaussians; `basis` and `confidence`
+    are whether the coordinates are in one, and whether the features have it."""
     mean, components = (shape_only("float32", shape) for shape in ((space.channels,), (rank, space.channels)))
     arrays, header = _contents(
         space,
@@ -232,6 +242,7 @@ def features_bytes(
         halves=shape_only("float16", (rows, rank)),
         channel_scale=shape_only("float32", (rank,)),
         weights=shape_only("float32", (rows,)),
+        confidence=shape_only("float16", (rows,)) if confidence else None,
         settings=settings,
         fingerprint="0" * FINGERPRINT_DIGITS,
     )
@@ -330,7 +341,13 @@ def _load_rows(folder: Path, name: str, gaussians: Gaussians) -> GaussianFeature
         values[rows] = file.array("features", "float16", ("n", "R")).astype(np.float32) * scale
         weights[rows] = seen
         space, mean, basis = read_space(file)
-        return GaussianFeatures(features=values, weights=weights, mean=mean, space=space, basis=basis)
+        confidence = None
+        if "confidence" in file:
+            confidence = np.zeros(n, np.float32)
+            confidence[rows] = file.array("confidence", "float16", ("n",))
+        return GaussianFeatures(
+            features=values, weights=weights, mean=mean, space=space, basis=basis, confidence=confidence
+        )
 
 
 SAMPLE = 20_000
@@ -366,18 +383,13 @@ class PrincipalAxes:
         for start in range(0, len(seen), AXES_BLOCK):
             rows = seen[start : start + AXES_BLOCK]
             values[rows] = centered_rows(features, rows) @ axes.T
-        return GaussianFeatures(
-            features=values,
-            weights=features.weights,
+        reduced = FeatureBasis(
             mean=features.mean,
+            components=np.ascontiguousarray(axes if basis is None else axes @ basis.components, np.float32),
+            energy_kept=float(self.energies[rank - 1]) * (1.0 if basis is None else basis.energy_kept),
             space=features.space,
-            basis=FeatureBasis(
-                mean=features.mean,
-                components=np.ascontiguousarray(axes if basis is None else axes @ basis.components, np.float32),
-                energy_kept=float(self.energies[rank - 1]) * (1.0 if basis is None else basis.energy_kept),
-                space=features.space,
-            ),
         )
+        return replace(features, features=values, basis=reduced)
 
 
 def principal_axes(features: GaussianFeatures) -> PrincipalAxes:
@@ -427,7 +439,8 @@ def reduce_to_fit(
         each = features[name]
         # All channels have no basis, which takes bytes of its own.
         all_channels = each.basis is None and rank == each.features.shape[1]
-        return features_bytes(each.space, int(each.seen.sum()), rank, header, basis=not all_channels)
+        stated = each.confidence is not None
+        return features_bytes(each.space, int(each.seen.sum()), rank, header, basis=not all_channels, confidence=stated)
 
     full = {name: each.features.shape[1] for name, each in features.items()}
     full_sizes = {name: size(name, rank) for name, rank in full.items()}

@@ -22,10 +22,10 @@ from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import ahead
 from gsencoder.data.up import upright_gaussians
-from gsencoder.fusion.basis import field_error
+from gsencoder.fusion.basis import field_error, to_coordinates
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
 from gsencoder.models.grid import cut_scene_curves
-from gsencoder.models.output_space import OutputSpaces, find_weights
+from gsencoder.models.output_space import OutputSpace, OutputSpaces, find_weights
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, check_unit
 
@@ -38,6 +38,8 @@ REGION_CELL = 256
 of attention on a surface is 180 voxels wide at their coarsest level, so no context lies beyond a gap of 256."""
 LEAST_REGION = 1_000
 """Gaussians of a region that is encoded by itself; smaller ones are strays, and are encoded together."""
+NAME_ROWS = 16_384
+"""Gaussians whose names are compared at a time."""
 LAST_CELL = 2**20
 """Further cells along an axis count as this one, so that three numbers of cells fit into one integer."""
 TOLERANCE = 1e-4
@@ -195,7 +197,20 @@ class Encoder:
                 values[teacher][chunk.core_rows] = features[:, part]
         if bad:
             raise InputError(f"encode: {bad} of {len(gaussians)} features are not finite; try precision=float32")
-        return {teacher: self.outputs[teacher].features(values[teacher]) for teacher in teachers}
+        return {
+            teacher: self.outputs[teacher].features(each, self._confidence(teacher, each, regions))
+            for teacher, each in values.items()
+        }
+
+    def _confidence(
+        self, teacher: str, restored: Float32[np.ndarray, "N channels"], regions: Int64[np.ndarray, " N"]
+    ) -> Float32[np.ndarray, " N"] | None:
+        """See `name_confidence`; None where the weights or the words beside them do not say enough."""
+        outputs, words = self.outputs[teacher], self.tables.get(teacher)
+        if not outputs.confidence or words is None or not words.trained:
+            return None
+        odds = name_odds(outputs, words.embeddings[[words.names.index(name) for name in words.trained]], restored)
+        return name_confidence(odds, regions, outputs.confidence)
 
     def export(self, path: str | Path) -> None:
         """Writes the encoder as one ONNX file in float32, which runs without torch, after comparing the two."""
@@ -207,6 +222,40 @@ class Encoder:
 
 
 load_encoder = Encoder.load
+CONTRAST = 0.1
+"""Temperature of the contrast that the encoder's names were trained with."""
+
+
+def name_odds(
+    outputs: OutputSpace, names: Float32[np.ndarray, "C D"], restored: Float32[np.ndarray, "N channels"]
+) -> Float32[np.ndarray, " N"]:
+    """The log-odds that the contrast of training gives the most probable of some names.
+
+    Args:
+        names: their vectors; those of synonyms are equal, and count once.
+        restored: coordinates in the basis, or vectors, of Gaussians.
+    """
+    vectors = np.unique(names, axis=0)
+    codes = outputs.standardize(vectors if outputs.basis is None else to_coordinates(outputs.basis, vectors))
+    odds = np.empty(len(restored), np.float32)
+    for start in range(0, len(restored), NAME_ROWS):
+        block = outputs.standardize(restored[start : start + NAME_ROWS])
+        scores = (block @ codes.T - 0.5 * np.square(codes).sum(axis=1)) / (CONTRAST * codes.shape[1])
+        scores.sort(axis=1)
+        others = np.log(np.exp(scores[:, :-1] - scores[:, -2:-1]).sum(axis=1)) + scores[:, -2]
+        odds[start : start + NAME_ROWS] = scores[:, -1] - others
+    return odds
+
+
+def name_confidence(
+    odds: Float32[np.ndarray, " N"], regions: Int64[np.ndarray, " N"], coefficients: Sequence[float]
+) -> Float32[np.ndarray, " N"]:
+    """The probability that the most probable name of each Gaussian is right: a logistic model of its log-odds and of
+    their mean over its region, since an encoder is as sure of details of a statue as of those of a sofa."""
+    intercept, own, mean = coefficients
+    means = np.bincount(regions, odds) / np.maximum(np.bincount(regions), 1)
+    logits = intercept + own * odds + mean * means[regions]
+    return (0.5 * (1 + np.tanh(logits / 2))).astype(np.float32)
 
 
 def file_of_encoder(weights: str) -> Path:

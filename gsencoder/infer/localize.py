@@ -20,7 +20,16 @@ from jaxtyping import Float, Float32, Float64, Int64, Integer
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.data.seeding.points import scene_spacing
-from gsencoder.infer.relevancy import Cluster, Evidence, Presence, ThresholdConfig, probability, relevancy, threshold
+from gsencoder.infer.relevancy import (
+    Cluster,
+    Evidence,
+    Presence,
+    ThresholdConfig,
+    expected_share,
+    probability,
+    relevancy,
+    threshold,
+)
 from gsencoder.text.table import TextEncoder, TextTable, check_space
 from gsencoder.text.vocabulary import OpenVocabulary, closed_table
 from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scene
@@ -97,9 +106,10 @@ def localize(
 
     The Gaussians of a word at or above the threshold are clustered (DBSCAN), and clusters that are parts of one thing
     joined (`cluster_by_gaps`); every one becomes a box with a score (`score_clusters`) and a probability
-    (`gsencoder.infer.relevancy`). Boxes that are less probable than `config.min_probability` are left out, and a word
-    that has no box is absent. One axis of oriented boxes follows the scene's up, where it is known. The scene's origin
-    is added back in float64. A word's boxes do not depend on the other queries, unless `config.contrast` is on.
+    (`gsencoder.infer.relevancy`), times the mean confidence of an encoder's features there. Boxes that are less
+    probable than `config.min_probability` are left out, and a word that has no box is absent. One axis of oriented
+    boxes follows the scene's up, where it is known. The scene's origin is added back in float64. A word's boxes do not
+    depend on the other queries, unless `config.contrast` is on.
 
     Args:
         space: name of the feature set; None where the scene has only one.
@@ -110,6 +120,7 @@ def localize(
         Relevancy, thresholds, probabilities, and the boxes best first within each word.
     """
     gaussians, features = select_features(scene, space)
+    expected_share(features, scene.name)
     scores, candidates = find_candidates(gaussians, features, queries, text, config, rivals=rivals, spacing=spacing)
     boxes: list[Box] = []
     probabilities = np.zeros(len(queries), np.float32)
@@ -117,6 +128,8 @@ def localize(
         rank = 0
         for each, evidence in zip(candidate.clusters, candidate.evidence, strict=True):
             value = probability(evidence)
+            if features.confidence is not None:
+                value *= float(features.confidence[each.rows].mean(dtype=np.float64))
             probabilities[number] = max(probabilities[number], value)
             if value < config.min_probability:
                 continue

@@ -22,6 +22,7 @@ The coefficients were fitted by `bench/presence.py`; `docs/measurements.md` has 
 """
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -30,7 +31,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures
@@ -362,6 +363,27 @@ def probability(evidence: Evidence) -> float:
         logit += coefficient * (1.0 if name == "intercept" else getattr(evidence, name))
     # The tanh form of the logistic function does not overflow.
     return 0.5 * (1 + math.tanh(logit / 2))
+
+
+KNOWN = 0.5
+"""Share of right names that an encoder must expect in a scene that it knows."""
+
+
+def expected_share(features: GaussianFeatures, scene: str) -> float | None:
+    """The share of Gaussians of a scene whose most probable names an encoder expects to be right, with a warning where
+    it is below `KNOWN`; None for features without confidence."""
+    if features.confidence is None or not features.seen.any():
+        return None
+    share = float(features.confidence[features.seen].mean(dtype=np.float64))
+    if share < KNOWN:
+        warnings.warn(
+            f"scene {scene}: the encoder expects {share:.0%} of its names in this scene to be right, fewer than half: "
+            "it looks like nothing that the encoder was trained on; `gsencoder fuse` on the splat asks a segmenter, "
+            "which looks at renders or photographs of it",
+            SceneWarning,
+            stacklevel=3,
+        )
+    return share
 
 
 class Presence:

@@ -199,7 +199,8 @@ def index_within(
     if not len(seen):
         raise InputError("index: no Gaussian has features")
     rows = seen[even_indices(len(seen), SAMPLE)]
-    sample = replace(features, features=features.stored(rows), weights=features.weights[rows], index=None)
+    stored, weights = features.stored(rows), features.weights[rows]
+    sample = replace(features, features=stored, weights=weights, index=None, confidence=None)
     error_of_sample, error_of_all = _KindsError(sample), _KindsError(features)
 
     def megabytes(indexed: IndexMemory) -> float:

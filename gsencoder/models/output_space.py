@@ -31,7 +31,7 @@ class OutputSpace:
     """The space of an encoder's outputs: the feature space of restored and decoded features, its mean, the root mean
     square distance of features from it, and the basis in which outputs are coordinates, None if they are all D
     channels. They are relative to the mean if `centered`, as coordinates of a basis always are, and in units of the
-    scale if `scaled`."""
+    scale if `scaled`. `confidence` are the coefficients of `name_confidence`, where they were fitted."""
 
     space: FeatureSpace
     mean: Float32[np.ndarray, " D"]
@@ -39,6 +39,7 @@ class OutputSpace:
     basis: FeatureBasis | None = None
     centered: bool = True
     scaled: bool = True
+    confidence: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.mean.shape != (self.space.channels,):
@@ -49,6 +50,8 @@ class OutputSpace:
             raise InputError(f"OutputSpace.basis: expected {self.space.describe()}, got {self.basis.space.describe()}")
         if self.basis is not None and not self.centered:
             raise InputError("OutputSpace.centered: expected true with a basis, whose coordinates are about the mean")
+        if self.confidence and (len(self.confidence) != 3 or not all(map(math.isfinite, self.confidence))):
+            raise InputError(f"OutputSpace.confidence: expected no or three finite numbers, got {self.confidence}")
 
     @property
     def channels(self) -> int:
@@ -80,26 +83,32 @@ class OutputSpace:
             return outputs
         return replace(self, centered=True, scaled=True).standardize(self.restore(outputs))
 
-    def features(self, restored: Float32[np.ndarray, "N channels"]) -> GaussianFeatures:
+    def features(
+        self, restored: Float32[np.ndarray, "N channels"], confidence: Float32[np.ndarray, " N"] | None = None
+    ) -> GaussianFeatures:
         return GaussianFeatures(
             features=restored,
             weights=np.ones(len(restored), np.float32),
             mean=self.mean,
             space=self.space,
             basis=self.basis,
+            confidence=confidence,
         )
 
 
 def output_space_parts(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and header values of an output space in a file."""
     arrays, header = space_parts(outputs.space, outputs.mean, outputs.basis)
-    return arrays, {**header, "scale": outputs.scale, "centered": outputs.centered, "scaled": outputs.scaled}
+    header |= {"scale": outputs.scale, "centered": outputs.centered, "scaled": outputs.scaled}
+    return arrays, header | ({"confidence": list(outputs.confidence)} if outputs.confidence else {})
 
 
 def read_output_space(file: Archive) -> OutputSpace:
     space, mean, basis = read_space(file)
     switches = {name: bool(file.value(name, bool)) for name in ("centered", "scaled")}
-    return OutputSpace(space=space, mean=mean, scale=file.value("scale", float, int), basis=basis, **switches)
+    confidence = tuple(file.value("confidence", list)) if "confidence" in file else ()
+    scale = file.value("scale", float, int)
+    return OutputSpace(space=space, mean=mean, scale=scale, basis=basis, confidence=confidence, **switches)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

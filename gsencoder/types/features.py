@@ -1,6 +1,6 @@
 """Features: spaces, maps of one view, bases, vectors on Gaussians, memories and localizations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -142,6 +142,7 @@ class GaussianFeatures:
         weights: how much each Gaussian was seen, in summed blending weight (pixels); 0 = never.
         mean: of the space, which centered cosines remove; it equals `basis.mean` where there is a basis.
         index: for each Gaussian its row of the table, −1 where it was never seen; None where each has a row of its own.
+        confidence: the probability that the most probable name of a Gaussian is right, where an encoder states it.
     """
 
     features: Float32[np.ndarray, "rows channels"]
@@ -150,6 +151,7 @@ class GaussianFeatures:
     space: FeatureSpace
     basis: FeatureBasis | None = None
     index: Int32[np.ndarray, " N"] | None = None
+    confidence: Float32[np.ndarray, " N"] | None = None
 
     def __post_init__(self) -> None:
         columns = self.basis.rank if self.basis is not None else self.space.channels
@@ -168,6 +170,10 @@ class GaussianFeatures:
             last = len(self.features) - 1
             good = np.where(self.seen, (self.index >= 0) & (self.index <= last), self.index == -1)
             check_rows("GaussianFeatures", "index", good, f"0 to {last} where seen, else -1", self.index)
+        if self.confidence is not None:
+            check_array("GaussianFeatures", "confidence", self.confidence, "float32", (count,))
+            good = np.asarray((self.confidence >= 0) & (self.confidence <= 1))
+            check_rows("GaussianFeatures", "confidence", good, "probabilities", self.confidence)
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -176,6 +182,12 @@ class GaussianFeatures:
     def seen(self) -> Bool[np.ndarray, " N"]:
         """True where some view saw the Gaussian."""
         return self.weights > 0
+
+    def select(self, rows: np.ndarray) -> "GaussianFeatures":
+        """The features of some Gaussians; a table that they share stays whole."""
+        of_rows = {"features": self.features[rows]} if self.index is None else {"index": self.index[rows]}
+        confidence = None if self.confidence is None else self.confidence[rows]
+        return replace(self, weights=self.weights[rows], confidence=confidence, **of_rows)
 
     def stored(self, rows: np.ndarray | slice = slice(None)) -> Float32[np.ndarray, "n channels"]:
         """The vectors, or coordinates in the basis, of some Gaussians; those never seen have zeros."""

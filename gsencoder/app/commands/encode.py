@@ -33,6 +33,7 @@ from gsencoder.infer.encode_budget import (
     exact_encoding,
     realised_error,
 )
+from gsencoder.infer.relevancy import expected_share
 from gsencoder.models.output_space import HEADS_FILE, copy_heads, find_heads, teacher_of_space
 from gsencoder.text.table import file_of_teacher, save_tables
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
@@ -102,7 +103,9 @@ def run(config: EncodeCommandConfig, run: Run) -> None:
                 others = [space for space in encoder.spaces.values() if space not in spaces]
                 copy_heads(heads, folder / HEADS_FILE, spaces, left_out=others)
         gaussians = counted(run.results["gaussians"], "Gaussian")
-        run.print(f"{out}: features of {gaussians} in {run.timings['encode']:.1f} s")
+        share = run.results.get("expected_share")
+        names = "" if share is None else f"; {share:.0%} of their names are expected to be right"
+        run.print(f"{out}: features of {gaussians} in {run.timings['encode']:.1f} s{names}")
         where = "this scene" if config.basis_views else "the scenes held out of the training"
         for name, figures in run.results.get("teachers", {"": run.results}).items():
             of = f" for {name}" if name else ""
@@ -172,6 +175,7 @@ def _encode_into(
             "rank": features.features.shape[1],
             "basis": _basis_figures(scene, name, features, encoder, config, run),
             "space": features.space.describe(),
+            "expected_share": expected_share(features, scene.name),
             "features": file_of_teacher(FEATURES_FILE, None if single else name),
         }
         for name, features in by_teacher.items()

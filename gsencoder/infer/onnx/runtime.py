@@ -183,8 +183,8 @@ def _output_space(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
     if "components" in arrays:
         components, energy_kept = arrays["components"], values["energy_kept"]
         basis = FeatureBasis(mean=mean, components=components, energy_kept=energy_kept, space=space)
-    switches = {name: values[name] for name in ("centered", "scaled")}
-    return OutputSpace(space=space, mean=mean, scale=float(values["scale"]), basis=basis, **switches)
+    more = {name: values[name] for name in ("centered", "scaled")} | {"confidence": tuple(values.get("confidence", ()))}
+    return OutputSpace(space=space, mean=mean, scale=float(values["scale"]), basis=basis, **more)
 
 
 def _text_table(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TextTable:

@@ -59,11 +59,7 @@ def thin_for_display(scene: Scene, title: str, *, max_gaussians: int, advice: st
         factor = np.float32(np.sqrt(total / len(rows)))
         gaussians = gaussians.select(rows)
         gaussians = replace(gaussians, scales=gaussians.scales * factor)
-        weights = features.weights[rows]
-        if features.index is None:
-            features = replace(features, features=features.features[rows], weights=weights)
-        else:  # The table that Gaussians share stays whole.
-            features = replace(features, index=features.index[rows], weights=weights)
+        features = features.select(rows)
         notes.append(
             f"{len(rows):,} of {total:,} Gaussians are drawn and searched: evenly chosen, and enlarged {factor:.2f} "
             f"times. {advice or f'max_gaussians={total} takes all, a smaller number draws faster'}."

@@ -1,0 +1,177 @@
+"""Fits the confidence of an encoder's names, and judges it on scenes of other kinds.
+
+    python bench/confidence.py WEIGHTS LIBRARIES UNKNOWN OUT [--known FOLDER] [--homes 24] [--write]
+
+Homes of makes that no training saw say how often names are right. In the scenes UNKNOWN/SOURCE/SPLAT there is nothing
+that the encoder knows: none of its names is right. Those of `--known` are rooms without labels, which only count for
+false alarms. The evidence of each scene is kept in OUT. Every source is judged by coefficients that were fitted without
+it, half of the homes by those of the other half. `--write` puts the coefficients of all into the weights.
+"""
+
+import argparse
+import json
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from errors import existing_folder, one_line_errors, output_folder, positive
+from furnished import made_homes, names_of
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
+
+from gsencoder.core.errors import SceneWarning
+from gsencoder.data.furnished.library import load_libraries, select_makes
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.points import unit_of
+from gsencoder.data.up import with_up
+from gsencoder.infer.encode import Encoder, name_odds, scene_regions
+from gsencoder.models.encoder import load_weights, save_weights
+from gsencoder.models.output_space import OutputSpaces, find_weights
+from gsencoder.types import Gaussians
+
+SAMPLE = 20_000
+"""Gaussians of a scene that are kept."""
+HOME = "home"
+
+
+def evidence_of(encoder: Encoder, gaussians: Gaussians, unit: float, up: np.ndarray | None) -> dict[str, np.ndarray]:
+    """The log-odds of each Gaussian, and the number of its region."""
+    name = next(iter(encoder.tables))
+    words, outputs = encoder.tables[name], encoder.outputs[name]
+    assert words.trained
+    features = encoder.encode(gaussians, space=name, metres_per_unit=unit, up=up)
+    vectors = words.embeddings[[words.names.index(each) for each in words.trained]]
+    return {
+        "odds": name_odds(outputs, vectors, features.features),
+        "regions": scene_regions(gaussians.means, encoder.voxel / unit),
+        "kinds": names_of(features, words),
+    }
+
+
+def gather(arguments: argparse.Namespace, encoder: Encoder) -> Iterator[tuple[str, Path]]:
+    """The source of each scene, and the file of its evidence."""
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    models = select_makes(load_libraries([arguments.libraries]), "held_out")
+    for number in range(arguments.homes):
+        file = arguments.out / f"{HOME}_{number:03d}.npz"
+        if not file.exists():
+            ((labels, codes, _),) = made_homes(models, arguments.seed + number, 1)
+            found = evidence_of(encoder, labels.gaussians, 1.0, np.array([0.0, 0.0, 1.0]))
+            keep(file, found, found["kinds"] == codes)
+        yield HOME, file
+    folders = [("unknown", each) for each in sorted(arguments.unknown.iterdir())]
+    folders += [("known", each) for each in sorted(arguments.known.iterdir())] if arguments.known else []
+    for group, folder in folders:
+        for path in sorted(folder.iterdir()):
+            file = arguments.out / f"{group}_{folder.name}_{path.stem}.npz"
+            if not file.exists():
+                scene, _ = with_up(load_scene(path))
+                assert scene.gaussians is not None
+                found = evidence_of(encoder, scene.gaussians, unit_of(scene, encoder.voxel), scene.up)
+                keep(file, found, np.zeros(len(scene.gaussians), bool))
+            yield (folder.name if group == "unknown" else "known"), file
+
+
+def keep(file: Path, found: dict[str, np.ndarray], right: np.ndarray) -> None:
+    """Writes the evidence of an even sample of a scene."""
+    odds, regions = found["odds"], found["regions"]
+    means = (np.bincount(regions, odds) / np.maximum(np.bincount(regions), 1))[regions]
+    rows = np.random.default_rng(0).permutation(len(odds))[:SAMPLE]
+    np.savez(file, odds=odds[rows], means=means[rows], right=right[rows])
+    print(f"{file.stem}: {len(odds):,} Gaussians, {right.mean():.3f} right, log-odds {odds.mean():.2f}", flush=True)
+
+
+def fit(sources: list[str], scenes: list[dict[str, np.ndarray]]) -> tuple[float, float, float]:
+    """Coefficients for which homes together weigh as much as all unknown scenes, and each source as much as another."""
+    rows, right, weights = [], [], []
+    unknown = len(set(sources) - {HOME})
+    for source, scene in zip(sources, scenes, strict=True):
+        share = sources.count(source) * (1 if source == HOME else unknown)
+        rows.append(np.stack([scene["odds"], scene["means"]], axis=1))
+        right.append(scene["right"])
+        weights.append(np.full(len(scene["odds"]), 1 / (share * len(scene["odds"]))))
+    model = LogisticRegression(C=1e4).fit(
+        np.concatenate(rows), np.concatenate(right), sample_weight=np.concatenate(weights) * 1e5
+    )
+    own, mean = model.coef_[0].tolist()
+    return float(model.intercept_[0]), own, mean
+
+
+def confidence_in(scene: dict[str, np.ndarray], coefficients: tuple[float, float, float]) -> np.ndarray:
+    _, regions = np.unique(scene["means"], return_inverse=True)
+    centred = np.zeros(len(regions))
+    for region in range(regions.max() + 1):
+        centred[regions == region] = scene["means"][regions == region][0]
+    intercept, own, mean = coefficients
+    return 0.5 * (1 + np.tanh((intercept + own * scene["odds"] + mean * centred) / 2))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights")
+    parser.add_argument("libraries", type=Path)
+    parser.add_argument("unknown", type=existing_folder)
+    parser.add_argument("out", type=output_folder)
+    parser.add_argument("--known", type=existing_folder)
+    parser.add_argument("--homes", type=positive, default=24)
+    parser.add_argument("--seed", type=int, default=5000)
+    parser.add_argument("--write", action="store_true")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore", SceneWarning)
+    gathered = list(gather(arguments, Encoder.load(arguments.weights)))
+    sources = [source for source, _ in gathered]
+    scenes = [dict(np.load(file)) for _, file in gathered]
+    fitted = [number for number, source in enumerate(sources) if source != "known"]
+
+    def fit_without(left_out: set[int]) -> tuple[float, float, float]:
+        kept = [number for number in fitted if number not in left_out]
+        return fit([sources[number] for number in kept], [scenes[number] for number in kept])
+
+    homes = [number for number in fitted if sources[number] == HOME]
+    folds = [set(homes[::2]), set(homes[1::2])]
+    folds += [{n for n in fitted if sources[n] == each} for each in sorted(set(sources) - {HOME, "known"})]
+    everything = fit_without(set())
+    shares = np.zeros(len(scenes))
+    errors = []
+    for fold in folds:
+        coefficients = fit_without(fold)
+        for number in fold:
+            stated = confidence_in(scenes[number], coefficients)
+            shares[number] = stated.mean()
+            if sources[number] == HOME:
+                errors.append(stated.mean() - scenes[number]["right"].mean())
+    for number, source in enumerate(sources):
+        if source == "known":
+            shares[number] = confidence_in(scenes[number], everything).mean()
+        print(f"{source:28s} {gathered[number][1].stem:60s} {shares[number]:.3f} {scenes[number]['right'].mean():.3f}")
+    unknown = np.array([source not in (HOME, "known") for source in sources])
+    named = np.concatenate([scenes[number]["right"] for number in homes])
+    stated = np.concatenate([confidence_in(scenes[number], everything) for number in homes])
+    figures = {
+        "coefficients": everything,
+        "unknown scenes": int(unknown.sum()),
+        "sources": len(set(sources) - {HOME, "known"}),
+        "AUROC of scenes": roc_auc_score(~unknown, shares),
+        "alarms in known scenes": float((shares[~unknown] < 0.5).mean()),
+        "no alarm in unknown scenes": float((shares[unknown] >= 0.5).mean()),
+        "AUROC of names in homes": roc_auc_score(named, stated),
+        "share stated less share right, homes": float(np.mean(errors)),
+        "the same, absolute": float(np.mean(np.abs(errors))),
+    }
+    print(json.dumps(figures, indent=1))
+    if arguments.write:
+        network, outputs, made_by = load_weights(arguments.weights)
+        with_confidence = {
+            name: replace(each, confidence=everything) if each.space.text_encoder else each
+            for name, each in outputs.by_teacher.items()
+        }
+        save_weights(
+            find_weights(arguments.weights), network, OutputSpaces(by_teacher=with_confidence), made_by, dtype="float16"
+        )
+
+
+if __name__ == "__main__":
+    with one_line_errors():
+        main()
