@@ -44,6 +44,9 @@ _EXTRAS: dict[RoomType, tuple[float, float]] = {
     "storage room": (60, 100),
 }
 """Single things on floor, walls and ceiling, in addition to groups."""
+_KITCHEN_ROW = ("kitchen cabinet", "stove", "kitchen cabinet", "kitchen sink", "oven", *(2 * ["kitchen cabinet"]))
+_ON_DESKS = {"monitor": 0.6, "laptop": 0.4, "keyboard": 0.5, "desk lamp": 0.3, "telephone": 0.2}
+"""Things on desks, and how often."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,16 +112,9 @@ class Room:
         )[side]
 
     def is_free(self, box: Box) -> bool:
-        area, slack = self.area, 1e-6
-        inside = (
-            box.x0 > area.x0 - slack
-            and box.y0 > area.y0 - slack
-            and box.x1 < area.x1 + slack
-            and box.y1 < area.y1 + slack
-            and box.z0 > -slack
-            and box.z1 < self.height + slack
-        )
-        return bool(inside) and not any(box.overlaps(other) for other in self.taken)
+        area = self.area
+        over = (area.x0 - box.x0, area.y0 - box.y0, box.x1 - area.x1, box.y1 - area.y1, -box.z0, box.z1 - self.height)
+        return bool(max(over) < 1e-6) and not any(box.overlaps(other) for other in self.taken)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -351,35 +347,19 @@ class _Furnisher:
         """Pillows at the head of a bed and a blanket on it."""
         z = min(self.supports[-1][1], bed.z1) if self.supports and self.supports[-1][0] == bed else bed.z0 + 0.5
         head = np.array([round(math.cos(angle)), round(math.sin(angle))])
-        center, half = (
-            np.array([bed.x0 + bed.x1, bed.y0 + bed.y1]) / 2,
-            np.array([bed.x1 - bed.x0, bed.y1 - bed.y0]) / 2,
-        )
+        center = np.array([bed.x0 + bed.x1, bed.y0 + bed.y1]) / 2
+        half = np.array([bed.x1 - bed.x0, bed.y1 - bed.y0]) / 2
         across = np.abs([head[1], head[0]])
         width = float(across @ half)
         for each in np.linspace(-0.5, 0.5, 2 if width > 0.6 else 1) if self.rng.random() < 0.7 else ():
             spot = center + head * (abs(head @ half) - 0.35) + across * width * (each if width > 0.6 else 0.0)
             size = np.abs(head) * 0.38 + across * min(0.6, 0.8 * width)
-            self._shape(
-                "pillow",
-                slab(float(size[0]), float(size[1]), 0.12, rounded=True),
-                float(spot[0]),
-                float(spot[1]),
-                z,
-                "fabric",
-            )
+            self._shape("pillow", slab(*size, 0.12, rounded=True), *spot, z, "fabric")
         if self.rng.random() < 0.5:
             share = float(self.rng.uniform(0.35, 0.75))
             spot = center - head * abs(head @ half) * (1 - share)
             size = 2 * (np.abs(head) * abs(head @ half) * share + across * width) + 0.04
-            self._shape(
-                "blanket",
-                slab(float(size[0]), float(size[1]), 0.03, skirt=0.2),
-                float(spot[0]),
-                float(spot[1]),
-                z,
-                "fabric",
-            )
+            self._shape("blanket", slab(*size, 0.03, skirt=0.2), *spot, z, "fabric")
 
     def _shape(self, kind: str, shape: Mesh, x: float, y: float, z: float, finish: str) -> None:
         matrix = pose(x, y, z, 0.0, np.ones(3))
@@ -394,18 +374,10 @@ class _Furnisher:
             return
         angle = self._front()
         chair = "office chair" if self.rng.random() < 0.6 else "chair"
-        if (
-            self._next_to(desk, chair, angle, float(self.rng.uniform(-0.35, 0.25)), turn=float(self.rng.normal(0, 0.4)))
-            is None
-        ):
+        gap, turn = float(self.rng.uniform(-0.35, 0.25)), float(self.rng.normal(0, 0.4))
+        if self._next_to(desk, chair, angle, gap, turn=turn) is None:
             self._next_to(desk, chair, angle, 0.05)
-        for kind, share in (
-            ("monitor", 0.6),
-            ("laptop", 0.4),
-            ("keyboard", 0.5),
-            ("desk lamp", 0.3),
-            ("telephone", 0.2),
-        ):
+        for kind, share in _ON_DESKS.items():
             if self.rng.random() < share:
                 self._on(desk, kind, angle)
 
@@ -460,20 +432,7 @@ class _Furnisher:
         height, depth = float(self.rng.uniform(0.82, 0.92)), float(self.rng.uniform(0.55, 0.65))
         runs: list[tuple[float, float]] = []
         start = at
-        for kind in (
-            "refrigerator",
-            *self.rng.permutation(
-                [
-                    "kitchen cabinet",
-                    "stove",
-                    "kitchen cabinet",
-                    "kitchen sink",
-                    "oven",
-                    "kitchen cabinet",
-                    "kitchen cabinet",
-                ]
-            ).tolist(),
-        ):
+        for kind in ("refrigerator", *self.rng.permutation(_KITCHEN_ROW).tolist()):
             models = [
                 each
                 for each in self.models.get(kind, ())
@@ -569,20 +528,12 @@ class _Furnisher:
             return None
         size = self._scale()
         for _ in range(6):
-            yaw = (
-                float(self.rng.uniform(-math.pi, math.pi))
-                if angle is None
-                else angle + math.pi / 2 + float(self.rng.normal(0, 0.15))
-            )
+            turn = self.rng.uniform(-math.pi, math.pi) if angle is None else self.rng.normal(angle + math.pi / 2, 0.15)
+            yaw = float(turn)
             x, y = float(self.rng.uniform(box.x0, box.x1)), float(self.rng.uniform(box.y0, box.y1))
             place = box_of(model, x, y, support[1], yaw, size)
-            slack = 0.03
-            if (
-                place.x0 < box.x0 - slack
-                or place.x1 > box.x1 + slack
-                or place.y0 < box.y0 - slack
-                or place.y1 > box.y1 + slack
-            ):
+            over = (box.x0 - place.x0, place.x1 - box.x1, box.y0 - place.y0, place.y1 - box.y1)
+            if max(over) > 0.03:
                 continue
             others = [other for other in self.room.taken if other != box]
             if place.z1 > self.room.height or any(place.overlaps(other) for other in others):
@@ -615,10 +566,8 @@ class _Furnisher:
             if last - first < width + 0.3:
                 continue
             at = float(self.rng.uniform(first + 0.15, last - 0.15 - width))
-            clashes = any(
-                side == each[0] and at < each[2] + 0.2 and each[1] < at + width + 0.2 for each in room.openings
-            )
-            if clashes:
+            same = (each for each in room.openings if each[0] == side)
+            if any(at < each[2] + 0.2 and each[1] < at + width + 0.2 for each in same):
                 continue
             opening = (side, at, at + width, lower, upper)
             room.openings.append(opening)
@@ -669,9 +618,8 @@ class _Furnisher:
             x, y = self.room.at_wall(side, (begin + finish) / 2, 0.1)
             folds = int(self.rng.integers(3, 9))
             matrix = pose(x, y, bottom, -side * math.pi / 2, np.ones(3))
-            self.room.items.append(
-                Item(kind="curtain", matrix=matrix, shape=curtain(finish - begin, top - bottom, folds), finish="fabric")
-            )
+            shape = curtain(finish - begin, top - bottom, folds)
+            self.room.items.append(Item(kind="curtain", matrix=matrix, shape=shape, finish="fabric"))
             self.room.taken.append(self._before(side, begin, finish, bottom, top, 0.15))
 
     def _enclose(self) -> None:

@@ -124,35 +124,24 @@ def _point(area: Rectangle, side: int, along: float, out: float, z: float) -> tu
     }[side]
 
 
+def _face(area: Rectangle, side: int, *corners: tuple[float, float, float]) -> Quad:
+    """A quad of points of a wall, given as in `_point`."""
+    return _quad(*(_point(area, side, *each) for each in corners))
+
+
 def _panel(area: Rectangle, side: int, start: float, end: float, lower: float, upper: float) -> Quad:
-    return _quad(
-        _point(area, side, start, 0.0, lower),
-        _point(area, side, end, 0.0, lower),
-        _point(area, side, end, 0.0, upper),
-        _point(area, side, start, 0.0, upper),
-    )
+    return _face(area, side, (start, 0.0, lower), (end, 0.0, lower), (end, 0.0, upper), (start, 0.0, upper))
 
 
 def _sill(area: Rectangle, side: int, start: float, end: float, z: float, thickness: float) -> Quad:
-    return _quad(
-        _point(area, side, start, 0.0, z),
-        _point(area, side, end, 0.0, z),
-        _point(area, side, end, thickness, z),
-        _point(area, side, start, thickness, z),
-    )
+    return _face(area, side, (start, 0.0, z), (end, 0.0, z), (end, thickness, z), (start, thickness, z))
 
 
 def _reveal(
     area: Rectangle, side: int, start: float, end: float, lower: float, upper: float, thickness: float
 ) -> list[Quad]:
-    quads = [_sill(area, side, start, end, z, thickness) for z in (lower, upper) if z > 0]
-    for at in (start, end):
-        quads.append(
-            _quad(
-                _point(area, side, at, 0.0, lower),
-                _point(area, side, at, thickness, lower),
-                _point(area, side, at, thickness, upper),
-                _point(area, side, at, 0.0, upper),
-            )
-        )
-    return quads
+    sills = [_sill(area, side, start, end, z, thickness) for z in (lower, upper) if z > 0]
+    return sills + [
+        _face(area, side, (at, 0.0, lower), (at, thickness, lower), (at, thickness, upper), (at, 0.0, upper))
+        for at in (start, end)
+    ]
