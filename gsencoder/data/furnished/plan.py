@@ -354,12 +354,12 @@ class _Furnisher:
         for each in np.linspace(-0.5, 0.5, 2 if width > 0.6 else 1) if self.rng.random() < 0.7 else ():
             spot = center + head * (abs(head @ half) - 0.35) + across * width * (each if width > 0.6 else 0.0)
             size = np.abs(head) * 0.38 + across * min(0.6, 0.8 * width)
-            self._shape("pillow", slab(*size, 0.12, rounded=True), *spot, z, "fabric")
+            self._shape("pillow", slab(size[0], size[1], 0.12, rounded=True), spot[0], spot[1], z, "fabric")
         if self.rng.random() < 0.5:
             share = float(self.rng.uniform(0.35, 0.75))
             spot = center - head * abs(head @ half) * (1 - share)
             size = 2 * (np.abs(head) * abs(head @ half) * share + across * width) + 0.04
-            self._shape("blanket", slab(*size, 0.03, skirt=0.2), *spot, z, "fabric")
+            self._shape("blanket", slab(size[0], size[1], 0.03, skirt=0.2), spot[0], spot[1], z, "fabric")
 
     def _shape(self, kind: str, shape: Mesh, x: float, y: float, z: float, finish: str) -> None:
         matrix = pose(x, y, z, 0.0, np.ones(3))
