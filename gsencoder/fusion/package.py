@@ -58,6 +58,12 @@ def write_index(path: Path, scene: Scene, features: GaussianFeatures, *, fingerp
     write_archive(path, arrays, header)
 
 
+def _confidence_bytes(features: GaussianFeatures) -> dict[str, np.ndarray]:
+    """A byte a Gaussian, for features with confidence."""
+    confidence = features.confidence
+    return {} if confidence is None else {"confidence": np.rint(255 * confidence).astype(np.uint8)}
+
+
 def _index_dtype(rows: int) -> str:
     """The type of the numbers of a table's rows; its largest value stands for Gaussians that were never seen."""
     return "uint8" if rows < 256 else "uint16"
@@ -77,6 +83,7 @@ def _index_contents(
     arrays, header = scene_parts(scene)
     space_arrays, space_header = space_parts(features.space, features.mean, features.basis)
     arrays |= {**space_arrays, "index": index, "table": table, "channel_scale": channel_scale}
+    arrays |= _confidence_bytes(features)
     return arrays, header | space_header | {"form": INDEX_FORM, "fingerprint": fingerprint, "error": error}
 
 
@@ -126,7 +133,7 @@ NUMBERS = ("lightest", "heaviest", "error", "lowest")
 def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, error: float) -> CompactFeatures:
     """Writes splat and compact features, within an error of 1 − mean centered cosine, into an existing folder, which
     the caller makes appear whole or not at all."""
-    return _save_compact(folder, scene, compact(features, error=error))
+    return _save_compact(folder, scene, features, compact(features, error=error))
 
 
 def save_package_within(folder: Path, scene: Scene, features: GaussianFeatures, budget: Budget) -> CompactFeatures:
@@ -141,18 +148,22 @@ def save_package_within(folder: Path, scene: Scene, features: GaussianFeatures, 
             "levels": shape_only("float32", (int((1 << bits).sum()),)),
             "codes": shape_only("uint8", (seen, -(-int(bits.sum()) // 8))),
             "weight_codes": shape_only("uint8", (seen,)),
+            **_confidence_bytes(features),
         }
         numbers, unknown = dict.fromkeys(NUMBERS, LONGEST_NUMBER), "0" * FINGERPRINT_DIGITS
         return archive_bytes(*_contents(scene, features.seen, basis, coded, numbers, fingerprint=unknown))
 
-    return _save_compact(folder, scene, compact_within(features, budget, bytes_of))
+    return _save_compact(folder, scene, features, compact_within(features, budget, bytes_of))
 
 
-def _save_compact(folder: Path, scene: Scene, compacted: CompactFeatures) -> CompactFeatures:
+def _save_compact(
+    folder: Path, scene: Scene, features: GaussianFeatures, compacted: CompactFeatures
+) -> CompactFeatures:
     splat = _save_splat(folder, scene)
     seen = np.zeros(len(compacted), bool)
     seen[compacted.rows] = True
     coded = {name: getattr(compacted, name) for name in ("bits", "levels", "codes", "weight_codes")}
+    coded |= _confidence_bytes(features)
     numbers = {name: getattr(compacted, name) for name in NUMBERS}
     arrays, header = _contents(scene, seen, compacted.basis, coded, numbers, fingerprint=splat)
     write_archive(folder / PACKAGE_FILE, arrays, header)
@@ -169,7 +180,7 @@ def _contents(
     fingerprint: str,
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the header of a compact package; `coded` are bits, levels, codes and weight_codes of
-    `CompactFeatures`, `numbers` its `NUMBERS`."""
+    `CompactFeatures`, and the confidence of the features; `numbers` its `NUMBERS`."""
     arrays, header = scene_parts(scene)
     space_arrays, space_header = space_parts(basis.space, basis.mean, basis)
     arrays |= {**coded, "seen": np.packbits(seen), **space_arrays}
@@ -225,6 +236,9 @@ def load_package(folder: Path) -> Scene:
         check_splat(archive, gaussians, "pack this splat's own features")
         if len(gaussians) != len(features):
             raise InputError(f"expected features of {len(gaussians):,} Gaussians, got {len(features):,}")
+        if "confidence" in archive:
+            stated = archive.array("confidence", "uint8", (len(gaussians),))
+            features = replace(features, confidence=stated / np.float32(255))
         scene = read_scene(archive, gaussians)
     return replace(scene, features={features.space.name: features})
 

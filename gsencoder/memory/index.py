@@ -99,14 +99,7 @@ def index_features(
     index = np.full(len(features), -1, np.int32)
     index[seen] = row
     return IndexMemory(
-        features=GaussianFeatures(
-            features=table + offset,
-            weights=features.weights,
-            mean=features.mean,
-            space=features.space,
-            basis=features.basis,
-            index=index,
-        ),
+        features=replace(features, features=table + offset, index=index),
         threshold=threshold,
         error=max(1 - float(cosines.mean()), 0.0) if len(cosines) else 0.0,
         lowest=float(np.quantile(cosines, 0.001)) if len(cosines) else 1.0,

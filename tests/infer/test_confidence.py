@@ -14,10 +14,12 @@ from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.folder import features_bytes, load_features, principal_axes, save_features
+from gsencoder.fusion.package import save_index_package, save_package
 from gsencoder.infer.encode import Encoder, name_confidence, name_odds
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.onnx.runtime import from_metadata, to_metadata
 from gsencoder.infer.relevancy import expected_share
+from gsencoder.memory.index import index_features
 from gsencoder.models.encoder import load_weights, save_weights
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.text.table import TextTable
@@ -120,6 +122,19 @@ def test_files_keep_confidence_and_their_size_is_known(tmp_path: Path, rng: np.r
     fewer = principal_axes(features).reduced(features, 3)
     assert fewer.confidence is not None
     assert np.array_equal(fewer.confidence, stated)
+
+
+def test_packages_keep_confidence(tmp_path: Path, rng: np.random.Generator) -> None:
+    features = replace(make_features(200), confidence=rng.uniform(size=200).astype(np.float32))
+    scene = Scene(name="s", gaussians=random_gaussians(200))
+    for name in ("compact", "index"):
+        (tmp_path / name).mkdir()
+    save_package(tmp_path / "compact", scene, features, error=0.1)
+    indexed = index_features(features).features
+    save_index_package(tmp_path / "index", scene, indexed, error=0.1)
+    for name in ("compact", "index"):
+        (read,) = load_features(tmp_path / name).features.values()
+        assert read.confidence == pytest.approx(features.confidence, abs=0.5 / 255 + 1e-6)
 
 
 def two_things(confidence: float | None) -> Scene:
