@@ -28,6 +28,8 @@ from gsencoder.data.furnished.kinds import Kind, kind_of
 CATALOGUE = "PluginFurnitureCatalog.properties"
 OUTDOORS = ("Characters", "Exterior", "Vehicles")
 """Categories of a catalogue that rooms do not have."""
+USUAL_SIZE = (0.05, 4.0)
+"""Length in metres that half of a library's models exceed; outside it sizes are in another unit."""
 MAX_FACES = 100_000
 """Largest number of triangles of a model; larger ones are simplified."""
 MAX_TEXTURE = 256
@@ -137,7 +139,11 @@ def _read_catalogue(file: Path) -> tuple[list[Model], int]:
         if not rows:
             raise InputError(f"{CATALOGUE}: expected lines such as name#1=Chair")
         indoors = sum(row.get("category") not in OUTDOORS for row in rows.values())
-        return [model for number, row in sorted(rows.items()) if (model := _model_of(file, number, row))], indoors
+        models = [model for number, row in sorted(rows.items()) if (model := _model_of(file, number, row))]
+        typical = float(np.median([max(model.size) for model in models])) if models else USUAL_SIZE[0]
+        if not USUAL_SIZE[0] <= typical <= USUAL_SIZE[1]:
+            raise InputError(f"half of its models are longer than {typical:.3g} m; expected sizes in centimetres")
+        return models, indoors
 
 
 def _model_of(file: Path, number: int, row: dict[str, str]) -> Model | None:

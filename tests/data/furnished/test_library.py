@@ -116,6 +116,15 @@ def test_wrong_values_of_a_catalogue_are_named(more: dict[str, str], message: st
         load_libraries([path])
 
 
+@pytest.mark.parametrize("unit", [0.01, 10.0], ids=["metres", "millimetres"])
+def test_sizes_in_another_unit_are_told_from_centimetres(unit: float, tmp_path: Path) -> None:
+    sizes = {"Chair": (50.0, 50.0, 90.0), "Table": (120.0, 80.0, 75.0), "Mug": (9.0, 9.0, 11.0)}
+    rows = [(name, "Office", tuple(unit * side for side in size), {}) for name, size in sizes.items()]
+    path = write_library(tmp_path / "test.sh3f", catalogue(rows))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"test.sh3f: half of its models are longer than .* sizes in centimetres"):
+        load_libraries([path])
+
+
 def test_an_incomplete_library_and_a_model_without_faces_are_named(tmp_path: Path) -> None:
     missing = write_library(tmp_path / "missing.sh3f", files={"box/box.obj": b""})
     with pytest.raises(InputError, match=r"model test#1: .*expected the file box/box.obj"):
