@@ -21,8 +21,9 @@ from gsencoder.train.prepared import ScenePart, ViewRows
 from gsencoder.train.samples import Codes, RoomsConfig, TrainingScene
 from gsencoder.types import Cameras, Gaussians
 
-SLOTS = 16
-"""Smallest number of rooms from which samples are drawn in turn."""
+SLOTS = 512
+"""Smallest number of rooms from which samples are drawn in turn. A network that meets the same few dozen rooms for a
+hundred steps learns these by heart, and nothing of things elsewhere."""
 COUNTED = 24
 """Number of rooms in which labels are counted, to weight rare ones."""
 STORED = 0.5
