@@ -68,7 +68,10 @@ def test_targets_are_the_vectors_of_the_labels(library: Path) -> None:
     assert len(targets.rows.row_weights) == 0
 
 
-def test_a_room_has_its_number_of_samples_before_the_next_takes_its_slot(library: Path) -> None:
+def test_a_room_has_its_number_of_samples_before_the_next_takes_its_slot(
+    library: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsencoder.train.rooms.SLOTS", 16)
     rooms = stream(library)
     names = [rooms.scene(rooms.slots * visit)[0].name for visit in range(6)]
     assert names == ["room 0.0"] * 2 + ["room 0.1"] * 2 + ["room 0.2"] * 2

@@ -63,7 +63,7 @@ def walk_cameras(home: Home, surfaces: Surfaces, config: WalkConfig, rng: np.ran
     for _, area, height in home.rooms:
         count = max(3, round(config.views * area.size / floor))
         lower, upper = [area.x0 + 0.2, area.y0 + 0.2, 1.1], [area.x1 - 0.2, area.y1 - 0.2, min(1.8, height - 0.3)]
-        points = rng.uniform(lower, upper, (40 * count, 3))
+        points = rng.uniform(lower, upper, (12 * count, 3))
         free = points[surfaces.distance(points) > CLEARANCE][:count]
         if not len(free):
             free = np.array([[*points[0, :2], min(height - 0.3, 2.0)]])
