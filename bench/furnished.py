@@ -1,12 +1,15 @@
 """Names and boxes that an encoder finds in furnished rooms of makes that no training saw.
 
     python bench/furnished.py WEIGHTS LIBRARIES [--rooms 16] [--seed 1000] [--recolor gray] [--boxes] [--json FILE]
+    python bench/furnished.py WEIGHTS OTHER.sh3f --makes all --boxes           # a library that no training saw
+    python bench/furnished.py WEIGHTS LIBRARIES --kinds chair,mug --boxes      # kinds that were left out of the training
 
 A make is one model of the libraries; one in four of each kind with three or more is held out of every training. The
 splat of each home is what a walk sees, as seeds of 2 cm. `things` is the share of Gaussians of held-out makes whose
 most probable name, of all kinds, is the right one; `structure` that of walls, floors and ceilings; `boxes` the share of
-those things for whose name the first box has an IoU of 0.25 or more with one of them. Means over homes, with the
-standard error.
+those things for whose name the first box has an IoU of 0.25 or more with one of them; with --kinds, `wrong` is the share
+of pairs of such a thing and a name of theirs that the home lacks whose first box does. Means over homes, with the standard
+error.
 """
 
 import argparse
@@ -18,7 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from errors import one_line_errors, positive
+from errors import comma_separated, one_line_errors, positive
 
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.furnished.kinds import STRUCTURE, kinds
@@ -58,8 +61,11 @@ def names_of(features: GaussianFeatures, words: TextTable) -> np.ndarray:
     return relevancy(features, words.encode(list(kinds())), words.mean).argmax(axis=0)
 
 
-def found_boxes(scene: Scene, labels: LabeledSplat, names: Sequence[str], words: TextTable) -> list[bool]:
-    """For each thing of some names, whether the first box of its name overlaps one of that name."""
+def found_boxes(
+    scene: Scene, labels: LabeledSplat, names: Sequence[str], words: TextTable, absent: Sequence[str] = ()
+) -> tuple[list[bool], list[bool]]:
+    """For each thing of some names, whether the first box of its name overlaps one of that name, and whether that of
+    each name that no thing has overlaps it."""
     assert scene.gaussians is not None
     means, spacing = scene.gaussians.means, spacing_of(scene.gaussians)
     boxes: dict[str, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
@@ -69,13 +75,14 @@ def found_boxes(scene: Scene, labels: LabeledSplat, names: Sequence[str], words:
             boxes[name].append((means[rows].min(axis=0).astype(float), means[rows].max(axis=0).astype(float)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)
-        result = localize(scene, list(boxes), words, spacing=spacing)
-    first = {box.query: (box.aabb_min, box.aabb_max) for box in reversed(result.boxes)}
-    hits = []
+        result = localize(scene, [*boxes, *absent], words, spacing=spacing) if boxes else None
+    first = {box.query: (box.aabb_min, box.aabb_max) for box in reversed(result.boxes)} if result else {}
+    hits, wrong = [], []
     for name, of_name in boxes.items():
         best = max((aabb_iou(*first[name], *box) for box in of_name), default=0.0) if name in first else 0.0
         hits += [best >= 0.25] * len(of_name)
-    return hits
+        wrong += [other in first and aabb_iou(*first[other], *box) >= 0.25 for box in of_name for other in absent]
+    return hits, wrong
 
 
 def summary(values: Sequence[float]) -> dict[str, float]:
@@ -91,11 +98,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--recolor", action="append", choices=list(RECOLORS), default=None)
     parser.add_argument("--boxes", action="store_true")
+    parser.add_argument("--makes", choices=["held_out", "all"], default="held_out")
+    parser.add_argument("--kinds", type=comma_separated, default=[])
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     every = load_libraries([arguments.libraries])
-    held, models = held_out_models(every), select_makes(every, "held_out")
-    scored = sorted({model.kind.name for model in every if model.id in held} - set(STRUCTURE))
+    everything = arguments.makes == "all" or bool(arguments.kinds)
+    held, models = held_out_models(every), select_makes(every, "all" if everything else "held_out")
+    scored = sorted({model.kind.name for model in every if everything or model.id in held} - set(STRUCTURE))
+    scored = [name for name in scored if name in arguments.kinds or not arguments.kinds]
     encoder = Encoder.load(arguments.weights)
     words = encoder.words
     assert words is not None
@@ -111,7 +122,7 @@ def main() -> None:
             gaussians = replace(labels.gaussians, sh=RECOLORS[title](labels.gaussians.sh).astype(np.float32))
             features = encoder.encode(gaussians, space=space, up=np.array([0.0, 0.0, 1.0]))
             right = names_of(features, words) == codes
-            rows["things"].append(float(right[thing].mean()))
+            rows["things"].append(float(right[thing].mean()) if thing.any() else np.nan)
             rows["structure"].append(float(right[structure[codes]].mean()))
             if title == "as it is":
                 for code in np.unique(codes[thing]):
@@ -122,7 +133,11 @@ def main() -> None:
                     name=f"home {number}", gaussians=gaussians, features={features.space.name: features},
                     metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]),
                 )  # fmt: skip
-                rows["boxes"].append(float(np.mean(found_boxes(scene, labels, asked, words))))
+                absent = [name for name in arguments.kinds if name not in of_items]
+                hits, wrong = found_boxes(scene, labels, asked, words, absent)
+                rows["boxes"].append(float(np.mean(hits)) if hits else np.nan)
+                if arguments.kinds:
+                    rows["wrong"].append(float(np.mean(wrong)) if wrong else np.nan)
         line = {title: {key: round(values[-1], 3) for key, values in rows.items()} for title, rows in table.items()}
         print(f"home {number}: {len(codes):,} Gaussians, {line}", flush=True)
     figures = {title: {key: summary(values) for key, values in rows.items()} for title, rows in table.items()}
