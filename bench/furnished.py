@@ -1,15 +1,14 @@
 """Names and boxes that an encoder finds in furnished rooms of makes that no training saw.
 
     python bench/furnished.py WEIGHTS LIBRARIES [--rooms 16] [--seed 1000] [--recolor gray] [--boxes] [--json FILE]
-    python bench/furnished.py WEIGHTS OTHER.sh3f --makes all --boxes           # a library that no training saw
-    python bench/furnished.py WEIGHTS LIBRARIES --kinds chair,mug --boxes      # kinds that were left out of the training
+    python bench/furnished.py WEIGHTS OTHER.sh3f --makes all --boxes         # a library that no training saw
+    python bench/furnished.py WEIGHTS LIBRARIES --kinds chair,mug --boxes    # kinds that were left out of the training
 
 A make is one model of the libraries; one in four of each kind with three or more is held out of every training. The
 splat of each home is what a walk sees, as seeds of 2 cm. `things` is the share of Gaussians of held-out makes whose
 most probable name, of all kinds, is the right one; `structure` that of walls, floors and ceilings; `boxes` the share of
-those things for whose name the first box has an IoU of 0.25 or more with one of them; with --kinds, `wrong` is the share
-of pairs of such a thing and a name of theirs that the home lacks whose first box does. Means over homes, with the standard
-error.
+those things for whose name the first box has an IoU of 0.25 or more with one of them; with --kinds, `wrong` is the same
+for names of theirs that the home lacks. Means over homes, with the standard error.
 """
 
 import argparse
