@@ -58,7 +58,7 @@ def gather(arguments: argparse.Namespace, encoder: Encoder) -> Iterator[tuple[st
         file = arguments.out / f"{HOME}_{number:03d}.npz"
         if not file.exists():
             ((labels, codes, _),) = made_homes(models, arguments.seed + number, 1)
-            found = evidence_of(encoder, labels.gaussians, 1.0, np.array([0.0, 0.0, 1.0]))
+            found = evidence_of(encoder, labels.gaussians(), 1.0, np.array([0.0, 0.0, 1.0]))
             keep(file, found, found["kinds"] == codes)
         yield HOME, file
     folders = [("unknown", each) for each in sorted(arguments.unknown.iterdir())]

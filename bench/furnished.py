@@ -118,7 +118,8 @@ def main() -> None:
         asked = [kind if kind in scored else "" for kind in of_items]
         thing = np.array([bool(each) for each in asked])[labels.items]
         for title, rows in table.items():
-            gaussians = replace(labels.gaussians, sh=RECOLORS[title](labels.gaussians.sh).astype(np.float32))
+            gaussians = labels.gaussians()
+            gaussians = replace(gaussians, sh=RECOLORS[title](gaussians.sh).astype(np.float32))
             features = encoder.encode(gaussians, space=space, up=np.array([0.0, 0.0, 1.0]))
             right = names_of(features, words) == codes
             rows["things"].append(float(right[thing].mean()) if thing.any() else np.nan)

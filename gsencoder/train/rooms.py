@@ -44,11 +44,11 @@ class LabeledPart(ScenePart):
     metres_per_unit: float | None = 1.0
 
     def __len__(self) -> int:
-        return len(self.splat.gaussians)
+        return len(self.splat.means)
 
     @property
     def means(self) -> Float32[np.ndarray, "N 3"]:
-        return self.splat.gaussians.means
+        return self.splat.means
 
     @property
     def cameras(self) -> Cameras:
@@ -67,7 +67,7 @@ class LabeledPart(ScenePart):
         return np.array([0.0, 0.0, 1.0])
 
     def gaussians(self, rows: np.ndarray) -> Gaussians:
-        return self.splat.gaussians.select(rows)
+        return self.splat.gaussians(rows)
 
     def codes(self, codebook: Float32[np.ndarray, "C channels"]) -> Int32[np.ndarray, " N"]:  # noqa: ARG002
         return self.codes_of_rows

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Float16, Float32, Float64, Int32, Int64, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import CheckedConfig, option
@@ -159,11 +159,18 @@ def furnished_scene(home: Home, name: str, config: WalkConfig, rng: np.random.Ge
 
 
 class LabeledSplat(NamedTuple):
-    """A splat, and the item that each Gaussian shows."""
+    """A splat, and the item that each Gaussian shows; as samples of surfaces, since a training holds hundreds of them."""
 
-    gaussians: Gaussians
+    means: Float32[np.ndarray, "N 3"]
+    normals: Float16[np.ndarray, "N 3"]
+    colors: Float16[np.ndarray, "N 3"]
     items: Int32[np.ndarray, " N"]
     cameras: Cameras
+    voxel: float
+
+    def gaussians(self, rows: np.ndarray | slice = slice(None)) -> Gaussians:
+        normals, colors = (each[rows].astype(np.float32) for each in (self.normals, self.colors))
+        return flat_gaussians(self.means[rows], normals, colors, largest=self.voxel, measured=False)
 
 
 def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random.Generator) -> LabeledSplat:
@@ -186,8 +193,8 @@ def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random
     if not len(samples.points):
         raise InputError("furnished: the walk sees nothing")
     items = _commonest(np.concatenate(keys), len(home.items), _voxel_keys(samples.points, voxel))
-    gaussians = flat_gaussians(samples.points, samples.normals, samples.colors, largest=voxel, measured=False)
-    return LabeledSplat(gaussians, items, believed)
+    normals, colors = samples.normals.astype(np.float16), samples.colors.astype(np.float16)
+    return LabeledSplat(samples.points, normals, colors, items, believed, voxel)
 
 
 _AXIS = 1 << 14

@@ -61,10 +61,10 @@ def test_without_noise_gaussians_lie_on_the_surfaces_that_they_are_named_for(hom
     voxel = 0.05
     splat = furnished_splat(home, SMALL, voxel, rng())
     surfaces = Surfaces(home, rng())
-    assert surfaces.distance(splat.gaussians.means).max() < voxel
+    assert surfaces.distance(splat.means).max() < voxel
     objects = objects_of(home, surfaces)
     for item in np.unique(splat.items):
-        means = splat.gaussians.means[splat.items == item]
+        means = splat.means[splat.items == item]
         assert (means > objects[item].aabb_min - voxel).all()
         assert (means < objects[item].aabb_max + voxel).all()
     assert {home.items[item].kind for item in np.unique(splat.items)} >= set(STRUCTURE)
