@@ -159,7 +159,7 @@ def furnished_scene(home: Home, name: str, config: WalkConfig, rng: np.random.Ge
 
 
 class LabeledSplat(NamedTuple):
-    """A splat, and the item that each Gaussian shows; as samples of surfaces, since a training holds hundreds of them."""
+    """A splat and the item that each Gaussian shows, as samples of surfaces: a training holds hundreds of them."""
 
     means: Float32[np.ndarray, "N 3"]
     normals: Float16[np.ndarray, "N 3"]
