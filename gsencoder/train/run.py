@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -232,7 +232,6 @@ def fit(
     stream = None
     if config.rooms.libraries:
         stream = room_stream(outputs, words, config, recipe)
-        recipe = replace(recipe, teachers=stream.balanced(recipe.teachers, track))
     score_encoder: Callable[[GaussianEncoder], ValidationResult] | None = None
     if validate is not None and held_out:
         held_out_parts = [_parts(datasets, path.name) for path in held_out]

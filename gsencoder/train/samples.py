@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int32, Int64, Integer
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -24,7 +24,7 @@ from gsencoder.data.up import turn, upright_gaussians
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, join_plans
 from gsencoder.train.losses import TERMS, Batch, LossConfig, RenderRows, TeacherRecipe, TeacherTargets
-from gsencoder.train.prepared import ClassBalance, ScenePart, ViewRows
+from gsencoder.train.prepared import ClassBalance, ScenePart, ViewRows, nearest_codes
 from gsencoder.types import SH_C0, Cameras, Gaussians
 from gsencoder.types.scene import perpendicular
 
@@ -320,13 +320,14 @@ def sample_rows(
 
 
 def make_render_rows(view: ViewRows, class_balance: ClassBalance, power: float) -> RenderRows:
-    """Rows of one view as tensors; the weight of each in the loss is n^−power of its target's class."""
+    """Rows of one view as tensors; the weight of each in the loss is n^−power, where n rows have its target's class."""
+    classes = nearest_codes(class_balance.codebook, view.targets) if power else np.zeros(len(view.targets), np.int64)
     return RenderRows(
         crow=torch.from_numpy(view.crow),
         col=torch.from_numpy(view.col),
         weight=torch.from_numpy(view.weight),
         targets=torch.from_numpy(view.targets),
-        row_weights=torch.from_numpy(class_balance.target_weights(view.targets, power)),
+        row_weights=torch.from_numpy(rarity_weights(classes, power)),
     )
 
 
@@ -536,7 +537,7 @@ def make_sample(
     `size` is the largest number of Gaussians; 0 = all that the views see."""
     source = scene.first
     first, first_codes = next((number, each) for number, each in enumerate(codes) if each is not None)
-    center_weights = _weights_of(first_codes, recipe.teachers[first].class_balance, recipe.sampling.center_power)
+    center_weights = rarity_weights(first_codes, recipe.sampling.center_power)
     views, selected = choose_crop(source.means, source.cameras, center_weights, recipe.sampling, size, rng)
     augmentation = recipe.augmentation
     remaining = drop_random(selected, augmentation.drop, rng) if augmentation is not None else selected
@@ -559,9 +560,14 @@ def make_sample(
     )
 
 
-def _weights_of(codes: Int32[np.ndarray, " N"], balance: ClassBalance, power: float) -> Float32[np.ndarray, " N"]:
-    """The weight n^−power of each Gaussian's class; 0 without a target, whose code −1 indexes the last row."""
-    return np.append(balance.class_weights(power), np.float32(0))[codes]
+def rarity_weights(codes: Integer[np.ndarray, " N"], power: float) -> Float32[np.ndarray, " N"]:
+    """The weight n^−power of each target, where its class has n of these targets, scaled to a mean of 1; 0 for those
+    without a class (−1)."""
+    present = codes >= 0
+    weights = np.zeros(len(codes), np.float32)
+    values = np.bincount(codes[present])[codes[present]].astype(np.float64) ** -power
+    weights[present] = values / values.mean() if len(values) else 1
+    return weights
 
 
 def _targets_of(
@@ -574,14 +580,13 @@ def _targets_of(
     remaining: Int64[np.ndarray, " n"],
 ) -> TeacherTargets:
     """The targets of one teacher for the remaining Gaussians, and its rows in the views."""
-    balance = teacher.class_balance
     rows = [empty_rows(teacher.channels)]
     for view in views if losses.render_weight and teacher.weight else ():
         view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
-        rows.append(make_render_rows(view_rows, balance, losses.rarity))
+        rows.append(make_render_rows(view_rows, teacher.class_balance, losses.rarity))
     return TeacherTargets(
         targets=torch.from_numpy(scene.float16_targets(remaining)),
         codes=torch.from_numpy(codes[remaining].astype(np.int64)),
-        loss_weights=torch.from_numpy(_weights_of(codes, balance, losses.rarity)[remaining]),
+        loss_weights=torch.from_numpy(rarity_weights(codes[remaining], losses.rarity)),
         rows=join_rows(rows, [0] * len(rows)),
     )
