@@ -51,7 +51,7 @@ def joint(datasets: Datasets, weights: Mapping[str, float] = {}, **changes: obje
     """Samples of all walls with the targets of both teachers."""
     recipe: SampleRecipe = samples(*datasets["sides"], **changes).recipe
     teachers = tuple(
-        TeacherRecipe(name=name, class_balance=dataset.load_class_balance(), weight=weights.get(name, 1.0))
+        TeacherRecipe(name=name, codebook=dataset.load_codebook(), weight=weights.get(name, 1.0))
         for name, (dataset, _) in datasets.items()
     )
     names = datasets["sides"][1]

@@ -51,7 +51,7 @@ from gsencoder.reconstruct.optimize import RowAdam, anchor_at, parameters_from
 from gsencoder.reconstruct.run import State, load_state, save_state
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.prepared import CLASS_BALANCE_FILE, SPACE_FILE
+from gsencoder.train.prepared import CODEBOOK_FILE, SPACE_FILE
 from gsencoder.types import FeatureSpace, Scene, Views
 
 FLIPS = 30
@@ -121,7 +121,7 @@ def prepared_file(folder: Path, name: str) -> Made:
         header = (one.cameras, one.metres_per_unit, one.up, one.view_names, dataset.has_scene(Path("wall_0")))
         return header, one.gaussians(rows), one.weights, one.targets(rows), views
 
-    readers = {"scene": read, SPACE_FILE: dataset.load_space, CLASS_BALANCE_FILE: dataset.load_class_balance}
+    readers = {"scene": read, SPACE_FILE: dataset.load_space, CODEBOOK_FILE: dataset.load_codebook}
     return dataset.scene_path(names[0]) if name == "scene" else folder / name, readers[name]
 
 
@@ -177,7 +177,7 @@ KINDS: dict[str, Callable[[Path], Made]] = {
     "encoder": encoder,
     "prepared scene": lambda folder: prepared_file(folder, "scene"),
     "space of prepared scenes": lambda folder: prepared_file(folder, SPACE_FILE),
-    "counts of prepared scenes": lambda folder: prepared_file(folder, CLASS_BALANCE_FILE),
+    "classes of prepared scenes": lambda folder: prepared_file(folder, CODEBOOK_FILE),
     "training": training,
     "reconstruction": reconstruction,
     "map of a teacher": teacher_map,

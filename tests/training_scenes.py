@@ -11,7 +11,6 @@ from splats import front_camera
 
 from gsencoder.core.archive import open_archive
 from gsencoder.core.logs import LOG_FILE, read_log
-from gsencoder.core.process import untracked
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.transformer import TransformerConfig
@@ -99,7 +98,7 @@ def prepared(folder: Path, *, count: int = 3, teacher: Teacher | None = None) ->
     fit_space(dataset, [Path(name) for name in names], lambda path: (scene(int(path.name[5:])), chosen), PREPARE)
     for number in range(count):
         add_scene(dataset, scene(number), chosen, PREPARE, source=Path(f"wall_{number}"))
-    dataset.count_classes(names, untracked)
+    dataset.cluster_classes(names)
     return dataset, names
 
 
@@ -108,7 +107,7 @@ def samples(dataset: PreparedDataset, names: Sequence[str], **changes: Any) -> S
     recipe = {
         "encoder": SMALL, "sampling": SamplingConfig(views=2, gaussians=200), "losses": LOSSES,
         "augmentation": Augmentation(turn=10.0), "seed": 3,
-        "teachers": (TeacherRecipe(name="sides", class_balance=dataset.load_class_balance()),),
+        "teachers": (TeacherRecipe(name="sides", codebook=dataset.load_codebook()),),
     }  # fmt: skip
     scenes = [TrainingScene([scene]) for scene in dataset.scenes(names)]
     return SampleDataset(scenes, SampleRecipe(**{**recipe, **changes}))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Int32, Int64
+from jaxtyping import Float, Float16, Float32, Int32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -22,7 +22,6 @@ from gsencoder.models.output_space import OutputSpace, check_heads_space
 from gsencoder.models.plan import Plan
 from gsencoder.render import Blend, BlendConfig
 from gsencoder.render.blend_cpu import Lattice
-from gsencoder.train.prepared import ClassBalance
 
 EPS = 1e-12
 
@@ -45,7 +44,7 @@ class LossConfig:
     temperature: float = option(0.1, "temperature of the softmax in L_contrast, in squared typical distances", gt=0)
     rarity: float = option(
         0.5,
-        "power p of class weights: targets of a class with n Gaussians are weighted by n^−p; 0 = equally",
+        "power p of class weights: targets are weighted by n^−p, where their class has n in the sample; 0 = equally",
         ge=0,
         le=4,
     )
@@ -123,14 +122,14 @@ class TeacherRecipe:
     may compare. The columns of the codebook are the teacher's columns of the encoder's outputs."""
 
     name: str
-    class_balance: ClassBalance
+    codebook: Float32[np.ndarray, "C channels"]
     weight: float = 1.0
     classes: bool = True
 
     @property
     def channels(self) -> int:
         """Columns of its targets."""
-        return self.class_balance.codebook.shape[1]
+        return self.codebook.shape[1]
 
 
 class AdapterHead(nn.Module):
@@ -326,7 +325,7 @@ class Distillation:
         its output columns, and adapter heads by teacher."""
         self.network, self.config = network, config
         self._widths = [teacher.channels for teacher in teachers]
-        self._codebooks = [torch.from_numpy(each.class_balance.codebook).to(device) for each in teachers]
+        self._codebooks = [torch.from_numpy(each.codebook).to(device) for each in teachers]
         self._heads = [
             [(head.to(device), decode.to(device)) for head, decode in heads.get(each.name, ())] for each in teachers
         ]

@@ -188,7 +188,7 @@ def prepare_scenes(
     what one of several teachers needs, such as labels, is prepared for the others, with a warning.
 
     Args:
-        training: scenes whose targets define the output spaces and the class balances.
+        training: scenes whose targets define the output spaces and their classes.
         words: the words of teachers that have any, by teacher.
         folder: of the prepared dataset, or of one for each of several teachers.
         voxel: edge length of the encoder's grid cells in metres, from which the unit of a splat is estimated if it is
@@ -256,8 +256,8 @@ def prepare_scenes(
     with fail_together():
         if process.is_first:
             _check_teachers(datasets, training, held_out)
-    for dataset in datasets.values():
-        dataset.count_classes([path.name for path in training], track, process)
+            for dataset in datasets.values():
+                dataset.cluster_classes([path.name for path in training])
     return datasets
 
 

@@ -13,7 +13,7 @@ import json
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,12 +28,10 @@ from gsencoder.core.archive import Archive, MappedArrays, open_archive, write_ar
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError, error_hint, error_prefix, listed, readable
 from gsencoder.core.files import read_foreign
-from gsencoder.core.process import ProcessRank, Track
 from gsencoder.core.settings import first_difference
 from gsencoder.data.scene_arrays import camera_arrays, read_cameras
 from gsencoder.fusion.basis import BINS, ProjectionSums
 from gsencoder.models.output_space import OutputSpace, read_output_space
-from gsencoder.train.distributed import fail_together, summed_array, value_of_first
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Scene, Teacher
 
 Precision = Literal["float16", "int8"]
@@ -406,28 +404,6 @@ MAX_CLUSTERS = 128
 """Largest number of target classes of a dense teacher."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ClassBalance:
-    """A codebook of target classes, in standard units, and their numbers of Gaussians in the dataset."""
-
-    codebook: Float32[np.ndarray, "C channels"]
-    counts: Float64[np.ndarray, " C"]
-
-    def class_weights(self, power: float) -> Float32[np.ndarray, " C"]:
-        """The weight n^−power of each class, scaled so that its mean over the targets of the dataset is 1. Classes
-        without Gaussians, to which cells across an edge may be nearest, get that of the most frequent class."""
-        counts = np.where(self.counts > 0, self.counts, max(float(self.counts.max()), 1.0))
-        weights = counts**-power
-        weights *= self.counts.sum() / max(float((weights * self.counts).sum()), 1e-30)
-        return weights.astype(np.float32)
-
-    def target_weights(self, targets: Float32[np.ndarray, "n channels"], power: float) -> Float32[np.ndarray, " n"]:
-        """The weight of each target's class; with the power 0 all are 1, and classes are not looked up."""
-        if power == 0:
-            return np.ones(len(targets), np.float32)
-        return self.class_weights(power)[nearest_codes(self.codebook, targets)]
-
-
 def nearest_codes(
     codebook: Float32[np.ndarray, "C channels"], targets: Float32[np.ndarray, "n channels"]
 ) -> Int64[np.ndarray, " n"]:
@@ -440,16 +416,6 @@ def nearest_codes(
     return np.concatenate(codes) if codes else np.zeros(0, np.int64)
 
 
-def count_targets(
-    scenes: Iterable[Float32[np.ndarray, "_n channels"]], codebook: Float32[np.ndarray, "C channels"]
-) -> ClassBalance:
-    """Counts the classes of a dataset's targets, scene by scene."""
-    counts = np.zeros(len(codebook))
-    for targets in scenes:
-        counts += np.bincount(nearest_codes(codebook, targets), minlength=len(codebook))
-    return ClassBalance(codebook=codebook, counts=counts)
-
-
 def cluster_targets(sample: Float32[np.ndarray, "n channels"], *, seed: int = 0) -> Float32[np.ndarray, "C channels"]:
     """A codebook for targets of a dense teacher: cluster centers of a sample of them."""
     from sklearn.cluster import MiniBatchKMeans
@@ -460,7 +426,7 @@ def cluster_targets(sample: Float32[np.ndarray, "n channels"], *, seed: int = 0)
     return np.asarray(kmeans.cluster_centers_, dtype=np.float32)
 
 
-SPACE_FILE, CLASS_BALANCE_FILE = "space.safetensors", "rarity.safetensors"
+SPACE_FILE, CODEBOOK_FILE = "space.safetensors", "codebook.safetensors"
 CLUSTERED_TARGETS = 200_000
 """Approximate number of targets, over all scenes, from which classes of a dense teacher are clustered."""
 
@@ -561,50 +527,25 @@ class PreparedDataset:
                 "another folder as prepared="
             )
 
-    def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:
-        """Counts the target classes of the training scenes that are prepared, and stores the counts, unless those of
-        these scenes are stored already. All processes of a training call this; each counts its share of the scenes."""
-        codebook = None
-        with fail_together():
-            if process.is_first:
-                codebook = self._classes_to_count(names)
-        codebook = value_of_first(codebook)
-        if codebook is None:
+    def cluster_classes(self, names: Sequence[str]) -> None:
+        """Stores the classes of targets that have no names, clusters of those of the training scenes, unless they are
+        stored already; the first process of a training calls this."""
+        path = self.folder / CODEBOOK_FILE
+        if self.load_space()[1] is not None or path.is_file():
             return
         scenes = self.scenes(names)
-        header = {"scenes": [scene.name for scene in scenes]}
-        with fail_together():
-            share = track(scenes[process.rank :: process.world_size], "counting targets")
-            counts = count_targets((_seen_targets(scene) for scene in share), codebook).counts
-        with fail_together():
-            counts = summed_array(counts)
-            if process.is_first:
-                arrays = {"codebook": codebook, "counts": counts}
-                write_archive(self.folder / CLASS_BALANCE_FILE, arrays, header)
+        share = max(1, CLUSTERED_TARGETS // len(scenes))
+        codebook = cluster_targets(np.concatenate([_seen_targets(scene, share) for scene in scenes]))
+        write_archive(path, {"codebook": codebook}, {"scenes": [scene.name for scene in scenes]})
 
-    def _classes_to_count(self, names: Sequence[str]) -> Float32[np.ndarray, "C channels"] | None:
-        """The codebook of the classes; None if the targets of these scenes have been counted."""
-        scenes, path = self.scenes(names), self.folder / CLASS_BALANCE_FILE
-        if path.is_file():
-            with error_hint("remove the file to count targets again"), open_archive(path) as file:
-                if {scene.name for scene in scenes} <= set(file.value("scenes", list)):
-                    return None
-        _, codebook = self.load_space()
-        if codebook is None:
-            scene_share = max(1, CLUSTERED_TARGETS // len(scenes))
-            codebook = cluster_targets(np.concatenate([_seen_targets(scene, scene_share) for scene in scenes]))
-        return codebook
-
-    def load_class_balance(self) -> ClassBalance:
-        """Loads the target classes and their frequencies, as stored by `count_classes`."""
-        channels = self.load_space()[0].channels
-        path = self.folder / CLASS_BALANCE_FILE
-        with error_hint("remove the file to count targets again"), open_archive(path) as file:
-            codebook = file.array("codebook", "float32", ("C", channels))
-            counts = file.array("counts", "float64", ("C",))
-            if not len(counts) or not (counts >= 0).all():
-                raise InputError("expected one or more target classes with counts of 0 or more")
-            return ClassBalance(codebook=codebook, counts=counts)
+    def load_codebook(self) -> Float32[np.ndarray, "C channels"]:
+        """The vectors of the target classes, in standard units."""
+        outputs, codebook = self.load_space()
+        if codebook is not None:
+            return codebook
+        path = self.folder / CODEBOOK_FILE
+        with error_hint("remove the file to cluster targets again"), open_archive(path) as file:
+            return file.array("codebook", "float32", ("C", outputs.channels))
 
     def find_scene(self, name: str) -> PreparedScene | None:
         """Opens a prepared scene by name; None if it is not prepared, for lack of what the teacher needs."""
@@ -616,9 +557,9 @@ class PreparedDataset:
         return [scene for name in names if (scene := self.find_scene(name)) is not None]
 
 
-def _seen_targets(scene: PreparedScene, max_targets: int = 0) -> Float32[np.ndarray, "n channels"]:
+def _seen_targets(scene: PreparedScene, max_targets: int) -> Float32[np.ndarray, "n channels"]:
     """The targets of the seen Gaussians of a scene, at most `max_targets` of them, evenly spaced; it is closed."""
     rows = np.flatnonzero(scene.weights)
-    targets = scene.targets(rows[:: -(-len(rows) // max_targets)] if max_targets else rows)
+    targets = scene.targets(rows[:: -(-len(rows) // max_targets)])
     scene.close()
     return targets

@@ -5,18 +5,16 @@ Room g of slot s of a run comes from (seed, s, g), and sample k from slot k mod 
 of samples of a step: a process, or a data worker of it, makes the rooms of its own slots alone.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float16, Float32, Float64, Int32
 
-from gsencoder.core.process import Track, untracked
 from gsencoder.data.furnished.library import Model, load_libraries, select_makes
 from gsencoder.data.furnished.plan import plan_home
 from gsencoder.data.furnished.walk import LabeledSplat, furnished_splat, splat_walk
-from gsencoder.train.losses import TeacherRecipe
 from gsencoder.train.prepared import ScenePart, ViewRows
 from gsencoder.train.samples import Codes, RoomsConfig, TrainingScene
 from gsencoder.types import Cameras, Gaussians
@@ -24,8 +22,6 @@ from gsencoder.types import Cameras, Gaussians
 SLOTS = 512
 """Smallest number of rooms from which samples are drawn in turn. A network that meets the same few dozen rooms for a
 hundred steps learns these by heart, and nothing of things elsewhere."""
-COUNTED = 24
-"""Number of rooms in which labels are counted, to weight rare ones."""
 STORED = 0.5
 """Share of storage rooms, in which things of all kinds are as frequent, among homes."""
 DENSITIES = (0.6, 1.4)
@@ -152,18 +148,3 @@ class RoomStream:
         splat = furnished_splat(home, walk, float(rng.uniform(*DENSITIES)) * self._voxel, rng)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
         return LabeledPart(name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook)
-
-    def balanced(self, teachers: Sequence[TeacherRecipe], track: Track = untracked) -> tuple[TeacherRecipe, ...]:
-        """The teachers, with the frequencies of labels in a training of which `share` of the samples is from rooms."""
-        balance = teachers[self._teacher].class_balance
-        of_rooms = np.zeros(len(self._codebook))
-        for number in track(range(COUNTED), "counting labels of rooms"):
-            part = self.labeled_part(np.random.default_rng([self._seed, 5, number]), f"room {number}")
-            of_rooms += np.bincount(part.codes_of_rows, minlength=len(of_rooms))
-        counts = self.share * of_rooms / of_rooms.sum() + (1 - self.share) * balance.counts / balance.counts.sum()
-        # Frequencies become numbers of Gaussians again, since a class without any is told by its count.
-        mixed = replace(balance, counts=counts * (of_rooms.sum() + balance.counts.sum()))
-        return tuple(
-            replace(each, class_balance=mixed) if number == self._teacher else each
-            for number, each in enumerate(teachers)
-        )

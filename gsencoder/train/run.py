@@ -236,7 +236,7 @@ def fit(
     if validate is not None and held_out:
         held_out_parts = [_parts(datasets, path.name) for path in held_out]
         others = [TrainingScene(parts) for parts in held_out_parts if any(part is not None for part in parts)]
-        codebooks = {teacher.name: teacher.class_balance.codebook for teacher in recipe.teachers}
+        codebooks = {teacher.name: teacher.codebook for teacher in recipe.teachers}
         score_encoder = lambda encoder: validate(others, encoder, outputs, codebooks)  # noqa: E731
     if process.world_size > 1:
         digests = [dataset.digest_of_scenes(training) for dataset in datasets.values()]
@@ -275,7 +275,7 @@ def room_stream(
     name = config.labels_teacher
     assert name is not None
     space, number = outputs[name], list(config.teachers_by_name).index(name)
-    codebook = recipe.teachers[number].class_balance.codebook
+    codebook = recipe.teachers[number].codebook
     vectors = words[name].encode(list(kinds()))
     coordinates = vectors if space.basis is None else to_coordinates(space.basis, vectors)
     codes = nearest_codes(codebook, space.standardize(coordinates))
@@ -298,7 +298,7 @@ def teacher_recipes(datasets: Mapping[str, PreparedDataset], losses: LossConfig)
     teachers = tuple(
         TeacherRecipe(
             name=name,
-            class_balance=dataset.load_class_balance(),
+            codebook=dataset.load_codebook(),
             weight=weight,
             classes=losses.contrast_clusters or dataset.load_space()[1] is not None,
         )

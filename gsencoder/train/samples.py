@@ -24,7 +24,7 @@ from gsencoder.data.up import turn, upright_gaussians
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, join_plans
 from gsencoder.train.losses import TERMS, Batch, LossConfig, RenderRows, TeacherRecipe, TeacherTargets
-from gsencoder.train.prepared import ClassBalance, ScenePart, ViewRows, nearest_codes
+from gsencoder.train.prepared import ScenePart, ViewRows, nearest_codes
 from gsencoder.types import SH_C0, Cameras, Gaussians
 from gsencoder.types.scene import perpendicular
 
@@ -319,9 +319,9 @@ def sample_rows(
     )
 
 
-def make_render_rows(view: ViewRows, class_balance: ClassBalance, power: float) -> RenderRows:
+def make_render_rows(view: ViewRows, codebook: Float32[np.ndarray, "C channels"], power: float) -> RenderRows:
     """Rows of one view as tensors; the weight of each in the loss is n^−power, where n rows have its target's class."""
-    classes = nearest_codes(class_balance.codebook, view.targets) if power else np.zeros(len(view.targets), np.int64)
+    classes = nearest_codes(codebook, view.targets) if power else np.zeros(len(view.targets), np.int64)
     return RenderRows(
         crow=torch.from_numpy(view.crow),
         col=torch.from_numpy(view.col),
@@ -520,7 +520,7 @@ def target_codes(scene: TrainingScene, recipe: SampleRecipe) -> Codes:
             result.append(None)
             continue
         if recipe.uses_classes(teacher):
-            result.append(part.codes(teacher.class_balance.codebook))
+            result.append(part.codes(teacher.codebook))
         else:
             result.append(np.where(part.weights > 0, np.int32(0), np.int32(-1)))
     return tuple(result)
@@ -536,7 +536,7 @@ def make_sample(
     """Makes a sample: selects views and Gaussians of a scene, augments them and computes the encoder's inputs. Its
     `size` is the largest number of Gaussians; 0 = all that the views see."""
     source = scene.first
-    first, first_codes = next((number, each) for number, each in enumerate(codes) if each is not None)
+    first_codes = next(each for each in codes if each is not None)
     center_weights = rarity_weights(first_codes, recipe.sampling.center_power)
     views, selected = choose_crop(source.means, source.cameras, center_weights, recipe.sampling, size, rng)
     augmentation = recipe.augmentation
@@ -583,7 +583,7 @@ def _targets_of(
     rows = [empty_rows(teacher.channels)]
     for view in views if losses.render_weight and teacher.weight else ():
         view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
-        rows.append(make_render_rows(view_rows, teacher.class_balance, losses.rarity))
+        rows.append(make_render_rows(view_rows, teacher.codebook, losses.rarity))
     return TeacherTargets(
         targets=torch.from_numpy(scene.float16_targets(remaining)),
         codes=torch.from_numpy(codes[remaining].astype(np.int64)),

@@ -10,12 +10,12 @@ from forked_ranks import RankServer
 from training_scenes import DenseSideTeacher, prepared, small_encoder
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import ProcessRank, available_cores, rank_from_environment, untracked
+from gsencoder.core.process import ProcessRank, available_cores, rank_from_environment
 from gsencoder.core.threads import threads_of_torch
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train.distributed import cpu_share, gpu_index, join_processes
-from gsencoder.train.prepared import CLASS_BALANCE_FILE, PreparedDataset
+from gsencoder.train.prepared import PreparedDataset
 from gsencoder.train.samples import TrainingScene
 
 SLURM_TASK = {"SLURM_STEP_ID": "0", "SLURM_NTASKS": "8", "SLURM_LOCALID": "1", "SLURM_STEP_NODELIST": "gpu[03-04]"}
@@ -102,7 +102,7 @@ SCRIPT = """
 import json
 from pathlib import Path
 
-from test_distributed import counted, scores_of
+from test_distributed import scores_of
 
 from gsencoder.train.distributed import join_processes
 from gsencoder.train.prepared import PreparedDataset
@@ -110,38 +110,29 @@ from gsencoder.train.prepared import PreparedDataset
 if __name__ == "__main__":
     with join_processes("cpu") as (process, _):
         dataset = PreparedDataset(Path({folder!r}))
-        counts = counted(dataset, {names!r}, process)
-        result = {{"counts": counts, **scores_of(dataset, {names!r})}}
+        result = scores_of(dataset, {names!r})
     Path({folder!r} + f".{{process.rank}}").write_text(json.dumps(result))
 """
-
-
-def counted(dataset: PreparedDataset, names: list[str], process: ProcessRank = ProcessRank()) -> list[list[float]]:
-    dataset.count_classes(names, untracked, process)
-    balance = dataset.load_class_balance()
-    return [balance.counts.tolist(), *balance.codebook.tolist()]
 
 
 def scores_of(dataset: PreparedDataset, names: list[str]) -> dict[str, object]:
     """The scores of an encoder, and which pictures there are."""
     scenes = [TrainingScene([scene]) for scene in dataset.scenes(names)]
     outputs = OutputSpaces(by_teacher={"sides": dataset.load_space()[0]})
-    codebooks = {"sides": dataset.load_class_balance().codebook}
+    codebooks = {"sides": dataset.load_codebook()}
     result = validate_names(scenes, small_encoder(outputs.widths), outputs, codebooks)
     return {"scores": dict(result.scores), "pictures": sorted(result.pictures)}
 
 
 @pytest.mark.alone
-def test_two_processes_count_and_validate_each_scene_once_and_as_one_does(tmp_path: Path, ranks: RankServer) -> None:
+def test_two_processes_validate_each_scene_once_and_as_one_does(tmp_path: Path, ranks: RankServer) -> None:
     dataset, names = prepared(tmp_path / "one", count=5, teacher=DenseSideTeacher())
-    one = {"counts": counted(dataset, names), **scores_of(dataset, names)}
+    one = scores_of(dataset, names)
     copy = shutil.copytree(tmp_path / "one", tmp_path / "two")
-    (copy / CLASS_BALANCE_FILE).unlink()
     script = tmp_path / "run.py"
     script.write_text(SCRIPT.format(folder=str(copy), names=names))
     ranks.started(script).end_well()
     first, second = (json.loads(Path(f"{copy}.{rank}").read_text()) for rank in (0, 1))
-    assert first["counts"] == second["counts"] == one["counts"]
     assert first["scores"] == pytest.approx(one["scores"], rel=1e-9)
     assert second["scores"] == first["scores"]
     # All pictures are drawn by the process that logs them.

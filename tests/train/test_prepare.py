@@ -20,7 +20,7 @@ from training_scenes import PREPARE, TABLE, DenseSideTeacher, SideTeacher, prepa
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import plain
-from gsencoder.core.process import ProcessRank, untracked
+from gsencoder.core.process import ProcessRank
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.labels import PaletteConfig
@@ -30,16 +30,14 @@ from gsencoder.train.memory import prepare_memory
 from gsencoder.train.prepare import PrepareConfig, add_scene, dataset_space, fit_space, prepare_scene, sampled_maps
 from gsencoder.train.prepare_scenes import SceneReader, SourceConfig, prepare_scenes, split_scenes
 from gsencoder.train.prepared import (
-    CLASS_BALANCE_FILE,
+    CODEBOOK_FILE,
     SPACE_FILE,
-    ClassBalance,
     PreparedDataset,
     PreparedScene,
     cluster_targets,
-    count_targets,
     nearest_codes,
 )
-from gsencoder.train.samples import SamplingConfig
+from gsencoder.train.samples import SamplingConfig, rarity_weights
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
 
@@ -87,12 +85,12 @@ def test_rows_of_some_views_are_stored_as_those_of_all_would_be_and_targets_are_
 
 
 def test_what_is_prepared_is_not_prepared_again(tmp_path: Path) -> None:
-    _, names = prepared(tmp_path, count=2)
-    files = (tmp_path / SPACE_FILE, tmp_path / CLASS_BALANCE_FILE)
+    _, names = prepared(tmp_path, count=2, teacher=DenseSideTeacher())
+    files = (tmp_path / SPACE_FILE, tmp_path / CODEBOOK_FILE)
     before = [path.read_bytes() for path in files]
     again = PreparedDataset(tmp_path, {"made": "for a test"})
-    fit_space(again, [], lambda path: (scene(0), SideTeacher()), PREPARE)
-    again.count_classes([], untracked)
+    fit_space(again, [], lambda path: (scene(0), DenseSideTeacher()), PREPARE)
+    again.cluster_classes([])
     assert [path.read_bytes() for path in files] == before
     assert again.has_scene(Path(names[0]))
     assert not again.has_scene(Path("wall_7"))
@@ -191,20 +189,22 @@ def test_scenes_of_two_spaces_none_and_a_teacher_that_says_the_same_everywhere_a
         dataset_space([Path("a")], lambda path: (scene(0), Blind()), PREPARE)
 
 
-def test_rarity_gives_each_kind_its_power_of_the_count_and_a_mean_of_one() -> None:
-    balance = ClassBalance(codebook=np.eye(3, dtype=np.float32), counts=np.array([100.0, 25.0, 0.0]))
-    weights = balance.class_weights(0.5)
-    assert weights[1] / weights[0] == pytest.approx(2.0, rel=1e-5)
-    assert (weights * balance.counts).sum() / 125 == pytest.approx(1.0, rel=1e-5)
-    assert weights[2] == weights[0]  # A cell between kinds may be nearest to one that no Gaussian has.
-    assert (balance.class_weights(0.0) == 1).all()
+def test_rarity_gives_each_class_its_power_of_the_count_and_a_mean_of_one() -> None:
+    codes = np.repeat([0, 1, -1, 4], [100, 25, 10, 1])
+    weights = rarity_weights(codes, 0.5)
+    assert weights[100] / weights[0] == pytest.approx(2.0, rel=1e-5)
+    assert weights[-1] / weights[0] == pytest.approx(10.0, rel=1e-5)
+    assert (weights[codes < 0] == 0).all()
+    assert weights[codes >= 0].mean() == pytest.approx(1.0, rel=1e-5)
+    np.testing.assert_array_equal(rarity_weights(codes, 0.0), codes >= 0)
+    assert (rarity_weights(np.full(3, -1), 1.0) == 0).all()
+    assert rarity_weights(codes[:0], 1.0).shape == (0,)
 
 
-def test_targets_are_counted_by_the_nearest_vector() -> None:
+def test_a_target_has_the_class_of_the_nearest_vector() -> None:
     codebook = np.array([[0, 0], [10, 0]], np.float32)
     targets = np.array([[1, 5], [9, -3], [6, 0]], np.float32)
     assert nearest_codes(codebook, targets).tolist() == [0, 1, 1]
-    assert count_targets([targets, targets[:1]], codebook).counts.tolist() == [2, 2]
     assert nearest_codes(codebook, targets[:0]).shape == (0,)
 
 
@@ -286,9 +286,10 @@ def test_gaussians_that_are_left_after_dropping_keep_their_own_targets(tmp_path,
     rows, sample = np.arange(len(part))[1::3], data[0]
     (own,) = sample.teachers
     assert len(sample.attributes) == len(rows)
-    targets, balance = part.targets(rows), data.recipe.teachers[0].class_balance
+    targets, codebook = part.targets(rows), data.recipe.teachers[0].codebook
     np.testing.assert_array_equal(own.targets.numpy(), targets)
-    weights = np.where(part.weights[rows] > 0, balance.target_weights(targets, data.recipe.losses.rarity), 0)
+    codes = np.where(part.weights[rows] > 0, nearest_codes(codebook, targets), -1)
+    weights = rarity_weights(codes, data.recipe.losses.rarity)
     np.testing.assert_allclose(own.loss_weights.numpy(), weights, rtol=1e-6)
     # The side of the wall that a Gaussian is on shows in its color, and in its target.
     far = np.abs(part.means[rows, 0]) > 0.3
@@ -485,9 +486,6 @@ def test_a_scene_is_prepared_for_each_teacher_that_it_has_and_again_where_its_fi
         files = {path.stem: path for path in (dataset.folder / "scenes").iterdir()}
         assert set(files) == {wall.name for wall in WALLS[:4]} - LACKING[name]
         paths |= {(name, wall): path for wall, path in files.items()}
-        # Classes are counted over the scenes to train on, and not over those held out.
-        seen = [np.count_nonzero(each.weights) for each in dataset.scenes([wall.name for wall in WALLS[:3]])]
-        assert dataset.load_class_balance().counts.sum() == sum(seen)
     for removed in paths.values():
         content = removed.read_bytes()
         before = {path: path.stat().st_mtime_ns for path in paths.values() if path != removed}

@@ -14,7 +14,6 @@ from gsencoder.data.furnished.library import load_libraries
 from gsencoder.train.loop import micro_batches
 from gsencoder.train.losses import LossConfig, TeacherRecipe
 from gsencoder.train.prepare_scenes import SourceConfig
-from gsencoder.train.prepared import ClassBalance
 from gsencoder.train.rooms import RoomStream, models_of
 from gsencoder.train.samples import Augmentation, RoomsConfig, SampleDataset, SampleRecipe, SamplingConfig
 
@@ -24,8 +23,8 @@ CODEBOOK = np.random.default_rng(0).normal(size=(len(CODE_OF), 6)).astype(np.flo
 
 @pytest.fixture(autouse=True)
 def _short_walks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("data.furnished.walk.MAX_VIEWS", 4), ("train.rooms.COUNTED", 4), ("train.rooms.SLOTS", 4)):
-        monkeypatch.setattr(f"gsencoder.{name}", value)
+    for name in ("data.furnished.walk.MAX_VIEWS", "train.rooms.SLOTS"):
+        monkeypatch.setattr(f"gsencoder.{name}", 4)
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +38,9 @@ def stream(library: Path, **changes: object) -> RoomStream:
 
 
 def recipe(**changes: object) -> SampleRecipe:
-    balance = ClassBalance(codebook=CODEBOOK, counts=np.ones(len(CODEBOOK)))
     settings = {
         "encoder": SMALL, "sampling": SamplingConfig(views=2, gaussians=300), "augmentation": Augmentation(recolor=1.0),
-        "losses": LossConfig(contrast_weight=1.0), "teachers": (TeacherRecipe(name="labels", class_balance=balance),),
+        "losses": LossConfig(contrast_weight=1.0), "teachers": (TeacherRecipe(name="labels", codebook=CODEBOOK),),
         "seed": 1, **changes,
     }  # fmt: skip
     return SampleRecipe(**settings)  # type: ignore[arg-type]
@@ -68,10 +66,7 @@ def test_targets_are_the_vectors_of_the_labels(library: Path) -> None:
     assert len(targets.rows.row_weights) == 0
 
 
-def test_a_room_has_its_number_of_samples_before_the_next_takes_its_slot(
-    library: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gsencoder.train.rooms.SLOTS", 16)
+def test_a_room_has_its_number_of_samples_before_the_next_takes_its_slot(library: Path) -> None:
     rooms = stream(library)
     names = [rooms.scene(rooms.slots * visit)[0].name for visit in range(6)]
     assert names == ["room 0.0"] * 2 + ["room 0.1"] * 2 + ["room 0.2"] * 2
@@ -108,16 +103,6 @@ def test_kinds_may_be_left_out_whole_and_misspelled_ones_are_named(library: Path
     assert every - {model.kind.name for model in models_of(config)} == {"couch", "bed"}
     with pytest.raises(InputError, match=r"rooms\.without=cauch: no such kind; the kinds are"):
         RoomsConfig(without=("cauch",))
-
-
-def test_frequencies_are_those_of_the_mixture(library: Path) -> None:
-    counts = np.zeros(len(CODEBOOK))
-    counts[CODE_OF["toy"]] = 100.0
-    balance = ClassBalance(codebook=CODEBOOK, counts=counts)
-    (mixed,) = stream(library).balanced([TeacherRecipe(name="labels", class_balance=balance)])
-    shares = mixed.class_balance.counts / mixed.class_balance.counts.sum()
-    assert shares[CODE_OF["toy"]] == pytest.approx(0.25, abs=0.01)
-    assert shares[CODE_OF["wall"]] > 0.1
 
 
 def test_made_rooms_need_a_teacher_of_labels(library: Path) -> None:

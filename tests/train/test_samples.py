@@ -23,7 +23,7 @@ from gsencoder.render import BlendConfig, blend
 from gsencoder.train import samples as module
 from gsencoder.train.loop import ErrorsAsValues, join_unless_error, micro_batches
 from gsencoder.train.losses import AdapterHead, Distillation, LossConfig, render_loss
-from gsencoder.train.prepared import PreparedDataset, PreparedScene, ViewRows
+from gsencoder.train.prepared import PreparedDataset, PreparedScene, ViewRows, nearest_codes
 from gsencoder.train.samples import (
     Augmentation,
     SampleDataset,
@@ -37,6 +37,7 @@ from gsencoder.train.samples import (
     join_samples,
     make_sample,
     nearest_rows,
+    rarity_weights,
     restrict_rows,
     target_codes,
 )
@@ -171,15 +172,14 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(dataset
     rewrite(path, {**arrays, "weights": np.where(np.arange(len(arrays["means"])) % 5 == 0, 0, arrays["weights"])})
     scene = PreparedScene(path)
     recipe = samples(*dataset, augmentation=None, sampling=SamplingConfig(gaussians=0)).recipe
-    balance, power = recipe.teachers[0].class_balance, recipe.losses.rarity
-    squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - balance.codebook).sum(axis=2)
+    codebook, power = recipe.teachers[0].codebook, recipe.losses.rarity
+    squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - codebook).sum(axis=2)
     expected = np.where(scene.weights > 0, squares.argmin(axis=1), -1)
     (codes,) = target_codes(TrainingScene([scene]), recipe)
     np.testing.assert_array_equal(codes, expected)
     (targets,) = SampleDataset([TrainingScene([scene])], recipe)[0].teachers
     np.testing.assert_array_equal(targets.codes.numpy(), expected)
-    weights = np.where(expected < 0, 0, balance.class_weights(power)[expected])
-    np.testing.assert_array_equal(targets.loss_weights.numpy(), weights)
+    np.testing.assert_array_equal(targets.loss_weights.numpy(), rarity_weights(expected, power))
 
 
 @pytest.mark.parametrize(
@@ -227,17 +227,15 @@ def test_all_kinds_are_equally_often_the_center_of_a_sample(dataset, monkeypatch
         return choose_crop(means, cameras, center_weights, *rest)
 
     monkeypatch.setattr("gsencoder.train.samples.choose_crop", record)
-    counts = recipe.teachers[0].class_balance.counts
-    sums = np.zeros(len(counts))
     for part in dataset[0].scenes(dataset[1]):
         scene = TrainingScene([part])
         (codes,) = target_codes(scene, recipe)
         make_sample(scene, (codes,), recipe, 200, np.random.default_rng(0))
         assert (drawn[-1][codes < 0] == 0).all()
-        np.add.at(sums, codes[codes >= 0], drawn[-1][codes >= 0])
-    occurring = counts > 0
-    assert len(set(counts[occurring])) > 1
-    np.testing.assert_allclose(sums[occurring], sums[occurring][0], rtol=1e-5)
+        counts = np.bincount(codes[codes >= 0])
+        sums = np.bincount(codes[codes >= 0], drawn[-1][codes >= 0])
+        assert len(set(counts[counts > 0])) > 1
+        np.testing.assert_allclose(sums[counts > 0], sums[counts > 0][0], rtol=1e-5)
 
 
 def rows_of(weights: list[list[float]], valid: list[bool] | None = None) -> ViewRows:
@@ -513,10 +511,10 @@ def test_centers_are_drawn_by_the_classes_of_the_first_teacher_that_a_scene_has(
         scene = data.scenes[0]
         having = TrainingScene([None if part is None else scene.parts[part] for part in parts])
         SampleDataset([having], data.recipe)[0]
-        own, balance = scene.parts[number], data.recipe.teachers[number].class_balance
+        own, codebook = scene.parts[number], data.recipe.teachers[number].codebook
         expected = np.zeros(len(own))
         seen = np.flatnonzero(own.weights)
-        expected[seen] = balance.target_weights(own.targets(seen), 1.0)
+        expected[seen] = rarity_weights(nearest_codes(codebook, own.targets(seen)), 1.0)
         np.testing.assert_allclose(given.pop(), expected, rtol=1e-5)
 
 

@@ -13,7 +13,6 @@ from training_scenes import LOSSES, PREPARE, SHORT, SideTeacher, made, prepared,
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.logs import LOG_FILE, read_log
-from gsencoder.core.process import untracked
 from gsencoder.core.settings import first_difference
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.teachers.labels import PaletteConfig
@@ -164,16 +163,6 @@ def test_names_that_a_scene_to_train_on_has_gained_need_other_prepared_scenes(da
     dataset.check_kinds(Dense())
     dataset.load_kinds = lambda: ("teapot", "mug")  # type: ignore[method-assign]
     dataset.check_kinds(Named())
-
-
-def test_classes_are_counted_again_when_a_scene_gains_the_teacher(tmp_path: Path) -> None:
-    dataset, names = prepared(tmp_path, count=2)
-    before = dataset.load_class_balance().counts.sum()
-    dataset.count_classes(names, untracked)
-    assert dataset.load_class_balance().counts.sum() == before
-    add_scene(dataset, scene(2), SideTeacher(), PREPARE, source=Path("wall_2"))
-    dataset.count_classes([*names, "wall_2"], untracked)
-    assert dataset.load_class_balance().counts.sum() > 1.3 * before
 
 
 def test_files_of_other_gaussians_are_refused(datasets: Datasets, tmp_path: Path) -> None:
