@@ -58,8 +58,8 @@ def gather(arguments: argparse.Namespace, encoder: Encoder) -> Iterator[tuple[st
         file = arguments.out / f"{HOME}_{number:03d}.npz"
         if not file.exists():
             ((labels, codes, _),) = made_homes(models, arguments.seed + number, 1)
-            found = evidence_of(encoder, labels.gaussians(), 1.0, np.array([0.0, 0.0, 1.0]))
-            keep(file, found, found["kinds"] == codes)
+            evidence = evidence_of(encoder, labels.gaussians(), 1.0, np.array([0.0, 0.0, 1.0]))
+            write_evidence(file, evidence, evidence["kinds"] == codes)
         yield HOME, file
     folders = [("unknown", each) for each in sorted(arguments.unknown.iterdir())]
     folders += [("known", each) for each in sorted(arguments.known.iterdir())] if arguments.known else []
@@ -69,14 +69,14 @@ def gather(arguments: argparse.Namespace, encoder: Encoder) -> Iterator[tuple[st
             if not file.exists():
                 scene, _ = with_up(load_scene(path))
                 assert scene.gaussians is not None
-                found = evidence_of(encoder, scene.gaussians, unit_of(scene, encoder.voxel), scene.up)
-                keep(file, found, np.zeros(len(scene.gaussians), bool))
+                evidence = evidence_of(encoder, scene.gaussians, unit_of(scene, encoder.voxel), scene.up)
+                write_evidence(file, evidence, np.zeros(len(scene.gaussians), bool))
             yield (folder.name if group == "unknown" else "known"), file
 
 
-def keep(file: Path, found: dict[str, np.ndarray], right: np.ndarray) -> None:
+def write_evidence(file: Path, evidence: dict[str, np.ndarray], right: np.ndarray) -> None:
     """Writes the evidence of an even sample of a scene."""
-    odds, regions = found["odds"], found["regions"]
+    odds, regions = evidence["odds"], evidence["regions"]
     means = (np.bincount(regions, odds) / np.maximum(np.bincount(regions), 1))[regions]
     rows = np.random.default_rng(0).permutation(len(odds))[:SAMPLE]
     np.savez(file, odds=odds[rows], means=means[rows], right=right[rows])
@@ -100,12 +100,8 @@ def fit(sources: list[str], scenes: list[dict[str, np.ndarray]]) -> tuple[float,
 
 
 def confidence_in(scene: dict[str, np.ndarray], coefficients: tuple[float, float, float]) -> np.ndarray:
-    _, regions = np.unique(scene["means"], return_inverse=True)
-    centred = np.zeros(len(regions))
-    for region in range(regions.max() + 1):
-        centred[regions == region] = scene["means"][regions == region][0]
     intercept, own, mean = coefficients
-    return 0.5 * (1 + np.tanh((intercept + own * scene["odds"] + mean * centred) / 2))
+    return 0.5 * (1 + np.tanh((intercept + own * scene["odds"] + mean * scene["means"]) / 2))
 
 
 def main() -> None:
