@@ -430,6 +430,7 @@ NOTHING = Augmentation(
     spread=0.0,
     lift=0.0,
     fade=0.0,
+    swell=0.0,
 )
 
 
