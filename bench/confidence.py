@@ -69,7 +69,7 @@ def gather(arguments: argparse.Namespace, encoder: Encoder) -> Iterator[tuple[st
             if not file.exists():
                 scene, _ = with_up(load_scene(path))
                 assert scene.gaussians is not None
-                evidence = evidence_of(encoder, scene.gaussians, unit_of(scene, encoder.voxel), scene.up)
+                evidence = evidence_of(encoder, scene.gaussians, unit_of(scene), scene.up)
                 write_evidence(file, evidence, np.zeros(len(scene.gaussians), bool))
             yield (folder.name if group == "unknown" else "known"), file
 

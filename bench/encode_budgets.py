@@ -39,7 +39,7 @@ def main() -> None:
     config, lines = EncodeConfig(chunk=given.chunk), []
     for path in given.scenes:
         scene = with_gaussians(load_scene(path), SeedConfig())
-        gaussians, unit = scene.gaussians, unit_of(scene, encoder.voxel)
+        gaussians, unit = scene.gaussians, unit_of(scene)
         for precision in encoder.precisions("auto"):
             few = gaussians.select(np.arange(min(1000, len(gaussians))))
             encoder.encode_spaces(few, EncodeConfig(precision=precision), metres_per_unit=unit)

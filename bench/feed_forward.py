@@ -67,7 +67,7 @@ def main() -> None:
         assert isinstance(teacher, LabelsTeacher)
         truth = fuse(scene, teacher).features
         start = time.perf_counter()
-        unit = unit_of(scene, encoder.voxel)
+        unit = unit_of(scene)
         dense = encoder.encode(scene.gaussians, space=teacher_name, metres_per_unit=unit)
         seconds["encoded, dense"].append(time.perf_counter() - start)
         made = {"encoded, dense": (dense, 2 * dense.features.shape[1])}

@@ -118,7 +118,7 @@ def score(arguments: argparse.Namespace) -> None:
     rows = {"fused": fused}
     for weights in arguments.weights:
         encoder = Encoder.load(weights)
-        unit = unit_of(kept, encoder.voxel)
+        unit = unit_of(kept)
         rows[Path(weights).name] = encoder.encode(kept.gaussians, metres_per_unit=unit)
     figures = {}
     for name, features in rows.items():

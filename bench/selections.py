@@ -231,7 +231,7 @@ def main() -> None:
             count, weighted = ious(others.labels == target.id, truth.labels == target.id, truth.weights)
             totals["other views"]["IoU"].append(count)
             totals["other views"]["weighted"].append(weighted)
-        unit = unit_of(scene, encoder.voxel)
+        unit = unit_of(scene)
         sources = {
             "fused": fuse(scene, LabelsConfig().build(scene, words)).features,
             "encoded": encoder.encode(scene.gaussians, metres_per_unit=unit),

@@ -55,7 +55,7 @@ def encoder_source(encoder: Encoder, config: EncodeConfig = EncodeConfig(), spac
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         assert scene.gaussians is not None
         start = time.perf_counter()
-        unit = unit_of(scene, encoder.voxel)
+        unit = unit_of(scene)
         features = encoder.encode(scene.gaussians, config, space=space, metres_per_unit=unit, up=scene.up)
         return features, {"encode": time.perf_counter() - start}
 

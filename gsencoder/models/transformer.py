@@ -466,10 +466,10 @@ def embed(
     offset: position of the center in its voxel, −1 to 1. color: degree-0 color, −1 for black to 1 for white, clamped to
     ±2. opacity: −1 to 1. scale: ¼ of log(scale / voxel), largest first. rotation: ¼ of the six distinct entries of
     R diag(log s − mean log s) Rᵀ, the off-diagonal ones times √2, so that distances between inputs are Frobenius
-    distances between matrices. normal: the same entries of R diag(w) Rᵀ − I/3, where w is the softmax of −4·log s: n nᵀ
-    − I/3 for a flat Gaussian with normal n, and 0 for a ball. height: z above the floor in 50 voxels and in 5, less 1, clamped to ±2 and ±1; z must be
-    up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). The voxel, in world units, is a tensor in an
-    exported graph, where it is an input.
+    distances between matrices. normal: these entries of R diag(w) Rᵀ − I/3, where w is the softmax of −4·log s, so of
+    n nᵀ − I/3 for a flat Gaussian with normal n, and 0 for a ball. height: z above the floor in 50 voxels and in 5,
+    less 1, clamped to ±2 and ±1; z must be up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). The
+    voxel, in world units, is a tensor in an exported graph, where it is an input.
     """
     channels: list[Tensor] = []
     log_scales = torch.log(scales.double() / voxel).clamp(-MAX_ABS_LOG_SCALE, MAX_ABS_LOG_SCALE).to(means.dtype)

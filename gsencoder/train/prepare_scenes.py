@@ -117,8 +117,8 @@ class SourceConfig:
 class SceneReader:
     """Reads scenes and builds teachers for them."""
 
-    def __init__(self, config: SourceConfig, words: Mapping[str, Words], voxel: float) -> None:
-        self.config, self.words, self.voxel = config, words, voxel
+    def __init__(self, config: SourceConfig, words: Mapping[str, Words]) -> None:
+        self.config, self.words = config, words
         self._shared: dict[str, Teacher] = {}
 
     def teacher(self, name: str, scene: Scene) -> Teacher:
@@ -154,7 +154,7 @@ class SceneReader:
     def with_gaussians(self, scene: Scene, path: Path) -> Scene:
         """A scene that `load` read, with Gaussians, of known unit, named by its path."""
         scene = with_gaussians(scene, self.config.seeds)
-        return replace(scene, name=path.name, metres_per_unit=unit_of(scene, self.voxel))
+        return replace(scene, name=path.name, metres_per_unit=unit_of(scene))
 
     def load(self, path: Path) -> Scene:
         """A scene with views, as it is on disk; cameras are placed in a splat without any."""
@@ -178,7 +178,6 @@ def prepare_scenes(
     config: SourceConfig,
     folder: Path,
     *,
-    voxel: float,
     heads: Sequence[str] = (),
     process: ProcessRank = ProcessRank(),
     device: torch.device = torch.device("cpu"),
@@ -191,8 +190,6 @@ def prepare_scenes(
         training: scenes whose targets define the output spaces and their classes.
         words: the words of teachers that have any, by teacher.
         folder: of the prepared dataset, or of one for each of several teachers.
-        voxel: edge length of the encoder's grid cells in metres, from which the unit of a splat is estimated if it is
-            unknown.
         heads: names of the teacher's adapter heads that are measured over the dataset.
 
     Returns:
@@ -202,10 +199,9 @@ def prepare_scenes(
     several, every = len(teachers) > 1, [*training, *held_out]
     folders = teacher_folders(folder, list(teachers))
     settings = {
-        name: _preparation_settings(training, words.get(name), teacher, config, voxel)
-        for name, teacher in teachers.items()
+        name: _preparation_settings(training, words.get(name), teacher, config) for name, teacher in teachers.items()
     }
-    reader, unmeasured = SceneReader(config, words, voxel), list[Head]()
+    reader, unmeasured = SceneReader(config, words), list[Head]()
     with_heads = teacher_of_heads(teachers, heads)
     with fail_together():
         datasets = {name: PreparedDataset(path, settings[name]) for name, path in folders.items()}
@@ -299,7 +295,7 @@ def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def _preparation_settings(
-    training: Sequence[Path], words: Words | None, teacher: TeacherConfig, config: SourceConfig, voxel: float
+    training: Sequence[Path], words: Words | None, teacher: TeacherConfig, config: SourceConfig
 ) -> dict[str, Any]:
     """Everything that the preparation for a teacher depends on, as JSON values."""
     settings = {
@@ -310,7 +306,7 @@ def _preparation_settings(
         "teacher": plain(teacher),
         "prepare": plain(config.prepare),
         "rooms": bool(config.rooms.libraries),
-        **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras, "voxel": voxel},
+        **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras},
     }
     # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.
     settings["teacher"].pop("heads", None)

@@ -194,7 +194,7 @@ def prepare(
         models_of(config.rooms)  # What cannot be read is an error before hours of preparation.
     place: dict[str, Any] = {"process": process, "device": device, "track": track}
     with threads_of_torch(cpu_share(process, config.prepare_threads)):
-        return prepare_scenes(scenes, held_out, words, config, folder, voxel=config.model.voxel, heads=heads, **place)
+        return prepare_scenes(scenes, held_out, words, config, folder, heads=heads, **place)
 
 
 def fit(

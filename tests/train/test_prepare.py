@@ -474,7 +474,7 @@ def reader(monkeypatch: pytest.MonkeyPatch) -> None:
 def prepare_both(folder: Path) -> dict[str, PreparedDataset]:
     config = SourceConfig(teachers={name: PaletteConfig() for name in TEACHERS}, prepare=PREPARE)
     with pytest.warns(SceneWarning, match="scenes lack what it needs"):
-        return prepare_scenes(WALLS[:3], WALLS[3:4], {}, config, folder, voxel=0.1)
+        return prepare_scenes(WALLS[:3], WALLS[3:4], {}, config, folder)
 
 
 @pytest.mark.usefixtures("reader")
@@ -509,11 +509,11 @@ def test_errors_name_the_options_of_one_of_several_teachers_as_they_are_typed(tm
     typed = rf"teachers\.{name}\.model: no file at teacher\.onnx or a/teacher\.model; lower teachers\.{name}\.size="
     config = SourceConfig(teachers={name: OnnxConfig(), "dense": PaletteConfig()}, prepare=PREPARE)
     with pytest.raises(InputError, match=typed):
-        prepare_scenes(WALLS[:1], [], {}, config, tmp_path / "several", voxel=0.1)
+        prepare_scenes(WALLS[:1], [], {}, config, tmp_path / "several")
     with pytest.raises(InputError, match=typed):
-        prepare_scenes(WALLS[:1], [], {}, SourceConfig(teachers={name: OnnxConfig()}), tmp_path / "one", voxel=0.1)
+        prepare_scenes(WALLS[:1], [], {}, SourceConfig(teachers={name: OnnxConfig()}), tmp_path / "one")
     with pytest.raises(InputError, match="^teacher.model: no file"):
-        prepare_scenes(WALLS[:1], [], {}, SourceConfig(teacher=OnnxConfig()), tmp_path / "single", voxel=0.1)
+        prepare_scenes(WALLS[:1], [], {}, SourceConfig(teacher=OnnxConfig()), tmp_path / "single")
 
 
 def test_names_of_teachers_that_differ_only_in_case_are_refused() -> None:
@@ -532,7 +532,7 @@ def test_a_process_among_several_says_at_once_why_it_stops(world, tmp_path, monk
     config = SourceConfig(teacher=PaletteConfig(), prepare=PREPARE)
     monkeypatch.setattr(Reader, "teacher", lambda *_: TEACHERS["coded"])
     with warnings.catch_warnings(record=True, action="always") as said, pytest.raises(InputError, match="its own"):
-        prepare_scenes(WALLS[:1], [], {}, config, tmp_path, voxel=0.1, process=ProcessRank(world_size=world))
+        prepare_scenes(WALLS[:1], [], {}, config, tmp_path, process=ProcessRank(world_size=world))
     assert [str(each.message) for each in said] == ["process 0 stops: its own"] * (world - 1)
 
 

@@ -139,7 +139,7 @@ def _encode_into(
 ) -> tuple[list[FeatureSpace], list[str]]:
     """Encodes a scene and writes its features and words; returns the spaces written, and a line for each limit."""
     assert scene.gaussians is not None
-    unit, budget = unit_of(scene, encoder.voxel), config.budget
+    unit, budget = unit_of(scene), config.budget
     # Without a known up, as it is: z may or may not be up then.
     gaussians = scene.gaussians if scene.up is None else upright_gaussians(scene.gaussians, scene.up)
     teachers = requested_teachers(encoder, config.spaces)

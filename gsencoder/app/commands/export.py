@@ -92,7 +92,7 @@ def run(config: ExportConfig, run: Run) -> None:
         network = encoder.network
         heads = find_heads(file_of_encoder(config.weights))
         clouds = [Cloud(f"{size} random Gaussians", random_cloud(size, encoder.voxel)) for size in config.sizes]
-        scenes = _scenes(config, encoder.voxel, run.track)
+        scenes = _scenes(config, run.track)
     run.print("translating the graph, which takes about a minute")
     with run.step("export"):
         lowered = network.lower()
@@ -177,7 +177,7 @@ def space_figures(encoder: Encoder) -> dict[str, Any]:
     return next(iter(figures.values())) if len(figures) == 1 else {"teachers": figures}
 
 
-def _scenes(config: ExportConfig, voxel: float, track: Track) -> list[Cloud]:
+def _scenes(config: ExportConfig, track: Track) -> list[Cloud]:
     """The splats that the user gave, for the comparison."""
     clouds = []
     for path in find_scenes(config.paths) if config.paths else ():
@@ -185,5 +185,5 @@ def _scenes(config: ExportConfig, voxel: float, track: Track) -> list[Cloud]:
         if scene.gaussians is None:
             scene = with_gaussians(scene, config.seeds, track=track)
         assert scene.gaussians is not None
-        clouds.append(Cloud(scene.name, scene.gaussians, unit_of(scene, voxel)))
+        clouds.append(Cloud(scene.name, scene.gaussians, unit_of(scene)))
     return clouds

@@ -199,7 +199,7 @@ def with_encoder(fusion: Fusion, encoder: "Encoder", scene: Scene, run: Run) -> 
             "encoder's words"
         )
     words = encoder.tables[name]
-    encoded = encoder.encode(scene.gaussians, space=name, metres_per_unit=unit_of(scene, encoder.voxel), up=scene.up)
+    encoded = encoder.encode(scene.gaussians, space=name, metres_per_unit=unit_of(scene), up=scene.up)
     features, by_encoder = surer_features(
         fusion.features, encoded, words.encode(words.trained or words.names), words.mean
     )

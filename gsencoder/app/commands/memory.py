@@ -205,7 +205,7 @@ def predicted_features(scene: Scene, config: MemoryCommandConfig) -> dict[str, G
     assert scene.gaussians is not None
     encoder = Encoder.load(config.weights, config.device)
     encoding = EncodeConfig(device=config.device)
-    return encoder.encode_spaces(scene.gaussians, encoding, metres_per_unit=unit_of(scene, encoder.voxel), up=scene.up)
+    return encoder.encode_spaces(scene.gaussians, encoding, metres_per_unit=unit_of(scene), up=scene.up)
 
 
 def in_space(predicted: Mapping[str, GaussianFeatures], space: FeatureSpace, weights: str) -> GaussianFeatures:

@@ -14,6 +14,7 @@ SIZE = 0.6
 sharpest by PSNR (0.5: −0.2 dB, 0.6: −0.2, 0.7: −1.0), but lets 1.3 % of the light through against 0.8 % at 0.6, and
 what passes takes its features to the surface behind."""
 THICKNESS = 0.1  # Standard deviation along the normal as a share of the in-plane one: about 1.2 mm at 2 cm
+SEED_VOXEL = 0.02  # Distance of seeds in metres, unless a setting says otherwise
 OPACITY = 0.95
 """A measured surface is opaque; what lies behind it must not take its features. The last 5 % leave a later
 optimization a gradient, which a logit of 7 (0.999) would not."""
@@ -251,15 +252,15 @@ def scene_spacing(means: Float32[np.ndarray, "N 3"]) -> float:
     return float(np.median(distances[:, -1]))
 
 
-def unit_of(scene: Scene, voxel: float) -> float:
+def unit_of(scene: Scene) -> float:
     """Metres per unit of a scene with Gaussians. Where the scene does not say, these are taken, with a warning, to lie
-    one `voxel` (metres) apart, as seeds do."""
+    as far apart as seeds do."""
     if scene.metres_per_unit is not None:
         return scene.metres_per_unit
     assert scene.gaussians is not None
     spacing = scene_spacing(scene.gaussians.means)
-    unit = voxel / spacing if spacing else 1.0
-    found = f"lie {spacing:.4g} units apart, which is taken for {voxel:g} m" if spacing else "all lie in one place"
+    unit = SEED_VOXEL / spacing if spacing else 1.0
+    found = f"lie {spacing:.4g} units apart, which is taken for {SEED_VOXEL:g} m" if spacing else "all lie in one place"
     warnings.warn(
         f"the unit of scene {scene.name!r} is unknown; its Gaussians {found}, so a unit for {unit:.4g} m; "
         "give data.metres_per_unit= if you know better",

@@ -20,7 +20,7 @@ from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import check_limits, option
 from gsencoder.data.seeding.depth import read_rgbd, seed_from_depth
 from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
-from gsencoder.data.seeding.points import seed_from_points, typical_spacing
+from gsencoder.data.seeding.points import SEED_VOXEL, seed_from_points, typical_spacing
 from gsencoder.types import Gaussians, Scene, Views
 
 TYPICAL_DEPTH_IN_VOXELS = 100
@@ -47,7 +47,7 @@ class SeedConfig:
         "mesh = a file; tsdf = RGB-D frames fused to a mesh first; auto = depth if the views have it, else points if "
         "the scene has them, else photographs",
     )
-    voxel: float = option(0.02, "edge of the grid in metres", gt=0, lt=math.inf)
+    voxel: float = option(SEED_VOXEL, "edge of the grid in metres", gt=0, lt=math.inf)
     mesh: str = option("", "the file of source=mesh, in world coordinates: in each scene's folder, else from here")
 
     def __post_init__(self) -> None:

@@ -173,7 +173,7 @@ def encoder_runs(path: Path, inputs: Inputs, points: int) -> Iterator[Runs]:
     """What is encoded at which numbers of Gaussians."""
     scene = with_gaussians(load_scene(path, options=inputs.data), inputs.seeds)
     encoder = encoder_of(EncoderSettings().weights, 0.0, 0)
-    encode = partial(encoder.encode_spaces, config=inputs.encode, metres_per_unit=unit_of(scene, encoder.voxel))
+    encode = partial(encoder.encode_spaces, config=inputs.encode, metres_per_unit=unit_of(scene))
     yield {"gaussians": [(size, partial(encode, part.gaussians)) for size, part in gaussian_sizes(scene, points)]}
 
 

@@ -355,7 +355,7 @@ def open_encoder(inputs: Inputs, path: Path) -> Iterator[Opened]:
             # A graph computes in the precision that it was exported in.
             config = replace(config, precision="auto")
         encoder = encoder_of(*shape) if settings.graph == "none" else graph_of(*shape, settings.graph)
-        space, unit = labels_of(settings.weights)[0], unit_of(scene, encoder.voxel)
+        space, unit = labels_of(settings.weights)[0], unit_of(scene)
         return encoder.encode(gaussians, config, space=space, metres_per_unit=unit, up=scene.up)
 
     @lru_cache
