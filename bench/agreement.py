@@ -1,0 +1,80 @@
+"""How often an encoder gives a real scene the names that a segmenter of its photographs gives it.
+
+    python bench/agreement.py WEIGHTS $S/scenes/kitchen [--voxel 0.02] [--json FILE]
+
+The scene is seeded from its depth, a segmenter (teacher=mosaic text=minilm) is fused over all photographs, and the same
+seeds are encoded. A Gaussian is compared where the commonest class that the segmenter gives it is one of the encoder's
+kinds, or one of their synonyms or hypernyms; a name agrees if the class is one of its own. `agreement` is the share of
+names that agree where the encoder's name, too, is one that the segmenter has a class for; `of_all` the share of all.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import numpy as np
+from errors import one_line_errors
+from furnished import names_of
+from json_option import add_json_option, write_figures
+
+from gsencoder.core.errors import SceneWarning
+from gsencoder.data.furnished.kinds import kinds
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.up import with_up
+from gsencoder.fusion.fuse import fuse
+from gsencoder.infer.encode import Encoder
+from gsencoder.infer.relevancy import relevancy
+from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
+from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
+
+
+def classes_of_kinds(classes: list[str]) -> list[set[int]]:
+    """For each kind the classes that name it: by its name, a synonym or a broader word."""
+    return [
+        {number for number, name in enumerate(classes) if name in (*kind.words, *kind.hypernyms) and name != "building"}
+        for kind in kinds().values()
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights")
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--voxel", type=float, default=0.02)
+    add_json_option(parser)
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore", SceneWarning)
+    encoder = Encoder.load(arguments.weights)
+    words, space = encoder.words, next(iter(encoder.tables))
+    assert words is not None
+    network = OnnxSegmenterOptions(scale=1.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+    vocabulary = vocabulary_of(OnnxTextConfig(model="minilm_l6", pooling="mean"))
+    teacher = SegmenterTeacher(SegmenterConfig(model="mosaic_ade31.onnx", onnx=network), vocabulary)
+    scene, _ = with_up(with_gaussians(load_scene(arguments.scene), SeedConfig(voxel=arguments.voxel)))
+    assert scene.gaussians is not None
+    fused = fuse(scene, teacher).features
+    classes = relevancy(fused, teacher.table, vocabulary.mean).argmax(axis=0)
+    encoded = encoder.encode(scene.gaussians, space=space, metres_per_unit=scene.metres_per_unit or 1.0, up=scene.up)
+    names = names_of(encoded, words)
+    agreeing = classes_of_kinds(list(teacher.names))
+    in_both = sorted(set().union(*agreeing))
+    compared = (fused.weights > 0) & np.isin(classes, in_both)
+    agrees = np.array([number in agreeing[kind] for number, kind in zip(classes, names, strict=True)])
+    comparable = compared & np.isin(names, [kind for kind, found in enumerate(agreeing) if found])
+    figures = {"agreement": agrees[comparable].mean(), "of_all": agrees[compared].mean()}
+    listed = ", ".join(f"{name} {share:.3f}" for name, share in figures.items())
+    print(f"{compared.sum():,} of {len(names):,} Gaussians compared: {listed}")
+    every = list(kinds())
+    for number in in_both:
+        rows = compared & (classes == number)
+        if rows.mean() > 0.001:
+            common = np.bincount(names[rows], minlength=len(every))
+            listed = ", ".join(f"{every[kind]} {common[kind] / rows.sum():.2f}" for kind in np.argsort(-common)[:5])
+            print(f"{teacher.names[number]:10} {rows.sum():7,} Gaussians, {agrees[rows].mean():.3f} agree: {listed}")
+    write_figures(arguments.json, figures)
+
+
+if __name__ == "__main__":
+    with one_line_errors():
+        main()
