@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.nn import functional
 
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import rotmats_from_quats
@@ -113,6 +114,23 @@ def test_one_ellipsoid_has_one_embedding_however_it_is_written() -> None:
     for other, sizes in ((-quats, scales), (renamed, scales[:, [1, 2, 0]])):
         again = embed(means, other, sizes, opacities, sh, voxel=0.1, attributes=names)
         torch.testing.assert_close(again, plain, rtol=1e-5, atol=1e-5)
+
+
+def test_the_normal_does_not_depend_on_how_large_or_thick_a_flat_gaussian_is() -> None:
+    flat = torch.tensor([[0.02, 0.02, 0.002]])
+    quats, zeros = functional.normalize(torch.randn(1, 4), dim=1), torch.zeros(1, 3)
+
+    def normal(scales: torch.Tensor) -> torch.Tensor:
+        return embed(zeros, quats, scales, torch.ones(1), zeros, voxel=0.03, attributes=("normal",))
+
+    plain = normal(flat)
+    n = rotmats_from_quats(quats)[0, :, 2]
+    expected = torch.outer(n, n) - torch.eye(3) / 3
+    torch.testing.assert_close(plain[0, :3], expected.diagonal(), atol=1e-3, rtol=0)
+    torch.testing.assert_close(plain[0, 3:], 2**0.5 * expected[[0, 0, 1], [1, 2, 2]], atol=1e-3, rtol=0)
+    for changed in (3 * flat, flat * torch.tensor([1.0, 1.0, 1e-6]), flat * torch.tensor([1.0, 2.0, 2.0])):
+        torch.testing.assert_close(normal(changed), plain, atol=0.02, rtol=0)
+    torch.testing.assert_close(normal(torch.full((1, 3), 0.01)), torch.zeros(1, 6), atol=1e-6, rtol=0)
 
 
 @pytest.mark.slow
