@@ -24,6 +24,9 @@ SLOTS = 512
 hundred steps learns these by heart, and nothing of things elsewhere."""
 STORED = 0.5
 """Share of storage rooms, in which things of all kinds are as frequent, among homes."""
+NOISE, DRIFT = (0.2, 2.5), 0.03
+"""Smallest and largest noise of the sensor, as in `WalkConfig`, and largest drift, metres: from clean meshes to seeds of
+a first-generation depth camera, whose walls are 2 cm thick (rms)."""
 DENSITIES = (0.6, 1.4)
 """Smallest and largest distance of the seeds, in voxels of the encoder."""
 
@@ -144,7 +147,8 @@ class RoomStream:
     def labeled_part(self, rng: np.random.Generator, name: str) -> LabeledPart:
         """Makes a room, seen on a walk with a sensor of random quality, with seeds of random density."""
         home = plan_home(self._models, rng, ("storage room",) if rng.random() < STORED else ())
-        walk = splat_walk(home, noise=float(rng.uniform(0.2, 1.5)), drift=float(rng.uniform(0, 0.02)))
+        noise = NOISE[0] * (NOISE[1] / NOISE[0]) ** rng.random()
+        walk = splat_walk(home, noise=noise, drift=float(rng.uniform(0, DRIFT)))
         splat = furnished_splat(home, walk, float(rng.uniform(*DENSITIES)) * self._voxel, rng)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
         return LabeledPart(name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook)

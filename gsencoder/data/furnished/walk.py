@@ -21,6 +21,8 @@ CLEARANCE = 0.25
 """Smallest distance of the camera from a surface, metres."""
 _GRAZING = 0.12
 """Cosine between ray and normal below which a sensor measures no depth."""
+_TILT = 0.25
+"""Error of the normals of a structured-light camera: of seeds of a kitchen the cosine with the plane around is 0.8."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -185,7 +187,7 @@ def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random
         kept = frame.depth > 0
         rays = believed.rays(view)[kept]
         seen = (believed.centers[view] + rays * frame.depth[kept][:, None]).astype(np.float32)
-        tilted = frame.normals[kept] + rng.normal(0, 0.12 * config.noise, (len(seen), 3))
+        tilted = frame.normals[kept] + rng.normal(0, _TILT * config.noise, (len(seen), 3))
         normals = (tilted / np.linalg.norm(tilted, axis=1, keepdims=True)).astype(np.float32)
         grid.add(seen, normals, frame.image[kept])
         keys.append(_voxel_keys(seen, voxel) * len(home.items) + frame.items[kept])
