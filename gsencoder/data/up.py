@@ -80,7 +80,7 @@ def up_of_cameras(cameras: Cameras) -> Float64[np.ndarray, "3"]:
 def up_of_scene(scene: Scene) -> Up | None:
     """Up of a scene, as its files state it or estimated from what it holds; None where nothing says.
 
-    Surfaces are those of the Gaussians, else those of the depth images. Where the normals of Gaussians agree on little,
+    Surfaces are those of the depth images, else those of the Gaussians. Where the normals of these agree on little,
     planes through their means are looked at as well, and the estimate with more confidence is taken. Where these agree
     on nothing either (`MIN_CONFIDENCE`), as on one soft object, level cameras alone say more.
     """
@@ -88,10 +88,10 @@ def up_of_scene(scene: Scene) -> Up | None:
         return Up(direction=scene.up, confidence=1.0, source="files")
     cameras = upright_views(scene.views).cameras if scene.views is not None else None
     surfaces = None
-    if scene.gaussians is not None:
-        surfaces = surfaces_of_gaussians(scene.gaussians)
-    elif scene.views is not None and scene.views.depths is not None:
+    if scene.views is not None and scene.views.depths is not None:
         surfaces = surfaces_of_depth(scene.views)
+    elif scene.gaussians is not None:
+        surfaces = surfaces_of_gaussians(scene.gaussians)
     up = None
     if cameras is not None or (surfaces is not None and surfaces.areas.sum() > 0):
         up = estimate_up(surfaces, cameras)

@@ -187,7 +187,7 @@ def test_level_cameras_decide_where_gaussians_lean_nowhere(room):
     gaussians = room.gaussians
     anyhow = Rotation.random(3000, random_state=1).as_quat(scalar_first=True).astype(np.float32)
     soft = replace(gaussians.select(np.arange(3000)), means=ball.astype(np.float32), quats=anyhow)
-    up = up_of_scene(replace(room, gaussians=soft))
+    up = up_of_scene(replace(room, gaussians=soft, views=replace(room.views, depths=None)))
     assert up.source == "cameras"
     assert up.confidence > 0.99
     np.testing.assert_allclose(up.direction, up_of_cameras(room.views.cameras), atol=1e-9)
