@@ -571,7 +571,7 @@ def rarity_weights(codes: Integer[np.ndarray, " N"], power: float) -> Float32[np
     without a class (−1)."""
     present = codes >= 0
     weights = np.zeros(len(codes), np.float32)
-    values = np.bincount(codes[present])[codes[present]].astype(np.float64) ** -power
+    values = (np.maximum(np.bincount(codes[present]), 1).astype(np.float64) ** -power)[codes[present]]
     weights[present] = values / values.mean() if len(values) else 1
     return weights
 
