@@ -24,11 +24,11 @@ vt 0 1
 usemtl body
 f 1/1 2/2 3/3 4/4
 f 5/1 8/2 7/3 6/4
-f 1/1 5/2 6/3 2/4
+f 1/1 4/2 8/3 5/4
 f 2/1 6/2 7/3 3/4
 f 4/1 3/2 7/3 8/4
 usemtl back
-f 1/1 4/2 8/3 5/4
+f 1/1 5/2 6/3 2/4
 """
 MATERIALS = "newmtl body\nKd 0.8 0.2 0.2\nnewmtl back\nKd 1 1 1\nmap_Kd back.png\n"
 MODELS: tuple[tuple[str, str, tuple[float, float, float], dict[str, str]], ...] = (

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from feature_fields import make_features, plain_features
+from rooms import merged
 from scipy.special import log_softmax, logsumexp
 from splats import random_gaussians
 
@@ -48,7 +49,8 @@ def confident(weights: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("basis", [False, True])
-def test_odds_are_those_of_the_softmax_over_distances(basis: bool, rng: np.random.Generator) -> None:
+def test_odds_are_those_of_the_softmax_over_distances(basis, rng, monkeypatch):
+    monkeypatch.setattr("gsencoder.infer.encode.NAME_ROWS", 16)
     mean = rng.normal(size=6).astype(np.float32)
     components = np.linalg.qr(rng.normal(size=(6, 4)))[0].T.astype(np.float32)
     within = FeatureBasis(mean=mean, components=components, energy_kept=0.9, space=SPACE) if basis else None
@@ -97,6 +99,9 @@ def test_an_encoder_states_confidence_if_its_weights_do(weights: Path, confident
     trained = encoder.tables["labels"].embeddings[:2]
     odds = name_odds(encoder.outputs["labels"], trained, stated.features)
     assert stated.confidence == pytest.approx(name_confidence(odds, np.zeros(300, np.int64), COEFFICIENTS))
+    rooms = [replace(each := random_gaussians(1000, seed), means=each.means + np.float32(99 * seed)) for seed in (0, 1)]
+    alone = [encoder.encode(room).confidence for room in rooms]
+    assert encoder.encode(merged(*rooms)).confidence == pytest.approx(np.concatenate(alone), abs=1e-5)
 
 
 def test_a_graph_carries_the_coefficients(confident: Path) -> None:
@@ -119,6 +124,7 @@ def test_files_keep_confidence_and_their_size_is_known(tmp_path: Path, rng: np.r
     assert read.confidence == pytest.approx(stated, abs=5e-4)
     size = (tmp_path / "features.safetensors").stat().st_size
     assert features_bytes(features.space, int(features.seen.sum()), 6, confidence=True) == pytest.approx(size, abs=64)
+    assert np.array_equal(features.select(np.arange(0, 200, 3)).confidence, stated[::3])  # type: ignore[arg-type]
     fewer = principal_axes(features).reduced(features, 3)
     assert fewer.confidence is not None
     assert np.array_equal(fewer.confidence, stated)
@@ -144,7 +150,7 @@ def two_things(confidence: float | None) -> Scene:
     means[60:, 0] += 1
     features = plain_features(np.repeat(WORDS.embeddings[:2], 60, axis=0), SPACE)
     if confidence is not None:
-        stated = np.concatenate([np.full(60, confidence), np.ones(60)])
+        stated = np.concatenate([np.clip(confidence + np.tile([-0.1, 0.1], 30), 0, 1), np.ones(60)])
         features = replace(features, confidence=stated.astype(np.float32))
     return Scene(name="s", gaussians=replace(gaussians, means=means), features={"six": features})
 
@@ -174,6 +180,8 @@ def test_a_known_scene_is_not_warned_of() -> None:
         localize(two_things(None), ["plant"], WORDS)
     (features,) = two_things(0.9).features.values()
     assert expected_share(features, "s") == pytest.approx(0.95)
+    unseen = replace(features, weights=np.repeat(np.float32([1, 0]), 60))
+    assert expected_share(unseen, "s") == pytest.approx(0.9)
 
 
 def test_encode_writes_the_share_and_warns(confident: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

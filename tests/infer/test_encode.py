@@ -146,11 +146,17 @@ def test_the_unit_of_the_scene_is_taken_into_account() -> None:
     np.testing.assert_allclose(there.features, encode(one, network, WHOLE).features, atol=1e-4)
 
 
-def seen_by(scene: Gaussians, config: EncodeConfig = WHOLE, unit: float = 1.0) -> list[Gaussians]:
+def seen_by(scene: Gaussians, config: EncodeConfig = WHOLE, unit: float = 1.0, **up: np.ndarray) -> list[Gaussians]:
     """What the network is run on."""
     network = Recording()
-    Encoder(network).encode(scene, config, metres_per_unit=unit)
+    Encoder(network).encode(scene, config, metres_per_unit=unit, **up)
     return network.seen
+
+
+def test_a_splat_is_turned_so_that_up_is_z_and_its_floor_at_0() -> None:
+    one = random_gaussians(300)
+    (seen,) = seen_by(one, up=np.array([0.0, -1.0, 0.0]))
+    np.testing.assert_allclose(seen.means[:, 2], np.quantile(one.means[:, 1], 0.99) - one.means[:, 1], atol=1e-4)
 
 
 def test_a_halo_is_as_many_metres_wide_in_every_unit_of_length() -> None:

@@ -51,10 +51,11 @@ def test_a_gaussian_that_one_of_them_has_not_seen_has_the_others_features() -> N
     other = noisy([3, 3, 3], [0.02] * 3, 4)
     other[2] = 0
     encoder = features(other, "encoder", weights=np.array([1, 0, 0], np.float32))
-    together, by_encoder = surer_features(teacher, encoder, NAMES, MEAN)
-    assert together.seen.tolist() == [True, True, False]
-    assert by_encoder.tolist()[:2] == [True, False]
-    assert not together.features[2].any()
+    for bias in (-3.0, 0.0, 3.0):
+        together, by_encoder = surer_features(teacher, encoder, NAMES, MEAN, bias=bias)
+        assert together.seen.tolist() == [True, True, False]
+        assert by_encoder.tolist()[:2] == [True, False]
+        assert not together.features[2].any()
 
 
 def test_with_a_bias_the_encoder_is_taken_more_often() -> None:

@@ -116,6 +116,13 @@ def test_one_ellipsoid_has_one_embedding_however_it_is_written() -> None:
         torch.testing.assert_close(again, plain, rtol=1e-5, atol=1e-5)
 
 
+def test_heights_are_in_units_of_fifty_and_of_five_voxels_above_the_floor() -> None:
+    z, others = torch.tensor([[-80.0], [0.0], [4.0], [40.0], [200.0]]), torch.rand(5, 4)
+    means = 0.02 * torch.cat([others[:, :2], z], dim=1)
+    heights = embed(means, others, others[:, :3], z[:, 0], means, voxel=0.02, attributes=("height",))
+    torch.testing.assert_close(heights, torch.tensor([[-2, -1], [-1, -1], [-0.92, -0.2], [-0.2, 1], [2, 1]]))
+
+
 def test_the_normal_does_not_depend_on_how_large_or_thick_a_flat_gaussian_is() -> None:
     flat = torch.tensor([[0.02, 0.02, 0.002]])
     quats, zeros = functional.normalize(torch.randn(1, 4), dim=1), torch.zeros(1, 3)

@@ -58,6 +58,8 @@ def test_a_sample_depends_on_its_number_alone(library: Path) -> None:
 
 def test_targets_are_the_vectors_of_the_labels(library: Path) -> None:
     sample = SampleDataset([], recipe(), stream(library))[0]
+    room, (of_room,) = stream(library).scene(0)
+    assert np.quantile(np.abs(room.first.means[of_room == CODE_OF["floor"], 2]), 0.9) < 0.1
     (targets,) = sample.teachers
     codes = targets.codes.numpy()
     assert len(np.unique(codes)) > 1
@@ -68,10 +70,15 @@ def test_targets_are_the_vectors_of_the_labels(library: Path) -> None:
 
 def test_a_room_has_its_number_of_samples_before_the_next_takes_its_slot(library: Path) -> None:
     rooms = stream(library)
-    names = [rooms.scene(rooms.slots * visit)[0].name for visit in range(6)]
-    assert names == ["room 0.0"] * 2 + ["room 0.1"] * 2 + ["room 0.2"] * 2
+    seen = [rooms.scene(rooms.slots * visit)[0] for visit in range(6)]
+    assert [room.name for room in seen] == ["room 0.0"] * 2 + ["room 0.1"] * 2 + ["room 0.2"] * 2
+    of_other_seed, codes = stream(library, seed=2, teachers=2, teacher=1).scene(0)
+    assert len({len(room.first) for room in (*seen, of_other_seed)}) == 4
+    assert [part is None for part in of_other_seed.parts] == [each is None for each in codes] == [True, False]
     made = {rooms.scene(number)[0].name for number in range(rooms.slots)}
     assert len(made) == rooms.slots
+    later = {rooms.scene(rooms.slots + number)[0].name for number in range(rooms.slots)}
+    assert 0 < len(made - later) < rooms.slots  # Not all are replaced at once.
 
 
 @pytest.mark.parametrize("step", [(3, 1, 2), (1, 2, 3), (4, 1, 1)])

@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ from splats import front_camera, random_gaussians
 from training_scenes import LOSSES, SMALL, samples, small_encoder
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.up import turn
+from gsencoder.data.up import turn, upright_gaussians
 from gsencoder.geometry import covariances
+from gsencoder.models.encoder import encoder_inputs
 from gsencoder.render import BlendConfig, blend
 from gsencoder.train import samples as module
 from gsencoder.train.loop import ErrorsAsValues, join_unless_error, micro_batches
@@ -374,7 +376,7 @@ def test_the_views_of_a_crop_look_at_its_center() -> None:
 
 def test_a_crop_holds_the_gaussians_nearest_to_its_center_that_the_views_see() -> None:
     points, camera = cloud(), front_camera()
-    chances = np.zeros(1000, np.float32)
+    chances = np.full(1000, 1e-9, np.float32)
     visible = np.flatnonzero(in_frusta(points, camera))
     chances[visible[7]] = 1
     config = SamplingConfig(views=1, rare_centers=1.0)
@@ -417,21 +419,7 @@ def test_crops_are_of_sizes_in_equal_ratios() -> None:
     assert crop_size(SamplingConfig(gaussians=0), RNG(0)) == 0
 
 
-NOTHING = Augmentation(
-    turn=0.0,
-    tilt=0.0,
-    mirror=0.0,
-    scale=0.0,
-    jitter=0.0,
-    drop=0.0,
-    light=0.0,
-    tint=0.0,
-    noise=0.0,
-    spread=0.0,
-    lift=0.0,
-    fade=0.0,
-    swell=0.0,
-)
+NOTHING = Augmentation(**dict.fromkeys(Augmentation.__dataclass_fields__, 0.0))
 
 
 def splat() -> Gaussians:
@@ -472,6 +460,31 @@ def test_heights_stay_but_for_the_tilt_and_a_floor_that_is_not_found() -> None:
     moved = augment(one, np.random.default_rng(3), replace(NOTHING, lift=1.0), voxel=0.02)
     assert np.ptp(moved.means[:, 2] - one.means[:, 2]) < 1e-4
     assert abs(float(moved.means[0, 2] - one.means[0, 2])) > 0.1
+    sized = augment(one, np.random.default_rng(3), replace(NOTHING, scale=0.5), voxel=0.0)
+    assert np.ptp(sized.means[:, 2] / one.means[:, 2]) < 1e-4  # The floor stays at 0.
+    found = [augment(one, np.random.default_rng(i), replace(NOTHING, lift=1e-9), voxel=0.02) for i in range(99)]
+    assert 0.03 < np.std([each.means[0, 2] for each in found]) < 0.05
+
+
+def test_a_crop_has_its_heights_above_the_scenes_floor_and_weights_by_its_own_counts(dataset, monkeypatch):
+    given: list[Gaussians] = []
+    monkeypatch.setattr(module, "encoder_inputs", lambda one, *rest: given.append(one) or encoder_inputs(one, *rest))
+    sampling = SamplingConfig(views=1, gaussians=40, smallest=0)
+    data = samples(*dataset, augmentation=None, sampling=sampling, losses=LossConfig(rarity=0.5))
+    sample, (targets,) = data[0], data[0].teachers
+    source = next(scene for scene in data.scenes if sample.name.startswith(scene.name)).first
+    heights = upright_gaussians(source.gaussians(np.arange(len(source))), source.up).means[:, 2]
+    assert np.abs(given[0].means[:, 2:] - heights).min(axis=1).max() < 1e-5
+    np.testing.assert_allclose(targets.loss_weights, rarity_weights(targets.codes.numpy(), 0.5), rtol=1e-5)
+
+
+def test_a_share_of_the_samples_is_of_the_stream(dataset, monkeypatch):
+    data, names = samples(*dataset), list[str]()
+    sample, made = data[0], SimpleNamespace(name="made")
+    data.stream = SimpleNamespace(share=0.8, scene=lambda number: (made, ()))
+    monkeypatch.setattr(module, "make_sample", lambda scene, *_: names.append(scene.name) or sample)
+    assert all(data[number] is sample for number in range(400))
+    assert names.count("made") / 400 == pytest.approx(0.8, abs=0.06)
 
 
 def test_light_changes_brightness_and_black_stays_near_black() -> None:

@@ -4,17 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from furniture import BOX, MODELS, catalogue, write_library
+from furniture import MODELS, catalogue, write_library
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.furnished import library
-from gsencoder.data.furnished.kinds import kinds
+from gsencoder.data.furnished.kinds import kind_of, kinds
 from gsencoder.data.furnished.library import Model, held_out_models, load_libraries, select_makes
-
-
-@pytest.fixture(scope="module")
-def models(tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, ...]:
-    return load_libraries([write_library(tmp_path_factory.mktemp("library") / "test.sh3f")])
 
 
 def test_a_model_has_the_size_of_the_catalogue_and_stands_on_the_floor(models: tuple[Model, ...]) -> None:
@@ -23,16 +18,17 @@ def test_a_model_has_the_size_of_the_catalogue_and_stands_on_the_floor(models: t
         np.testing.assert_allclose(upper - lower, model.size, rtol=1e-5)
         np.testing.assert_allclose((lower + upper)[:2], 0, atol=1e-6)
         assert lower[2] == pytest.approx(0, abs=1e-6)
+    assert {model.elevation for model in models} == {0, 0.9, 1.45}
 
 
-def test_the_front_of_a_model_is_at_the_lower_side_of_y(models: tuple[Model, ...]) -> None:
-    """In the file the textured side is at −z of y up, the back of the model."""
-    mesh = models[0].mesh
+@pytest.mark.parametrize(("rotation", "axis", "side"), [("1 0 0 0 1 0 0 0 1", 1, 1), ("0 0 1 0 1 0 -1 0 0", 0, 0)])
+def test_the_front_of_a_model_is_at_the_lower_side_of_y_after_its_rotation(rotation, axis, side, tmp_path):
+    """In the file the textured side is at −z of y up, the back of the model, which the second rotation takes to −x."""
+    rows = [(*MODELS[0][:3], {"modelRotation": rotation})]
+    mesh = load_libraries([write_library(tmp_path / "test.sh3f", catalogue(rows))])[0].mesh
     textured = [number for number, texture in enumerate(mesh.textures) if texture is not None]
     back = mesh.vertices[mesh.faces[np.isin(mesh.materials, textured)]].reshape(-1, 3)
-    sides = BOX.splitlines()[-1]
-    assert sides.startswith("f 1/1 4/2 8/3 5/4")  # x = −1
-    np.testing.assert_allclose(back[:, 0], mesh.vertices[:, 0].min())
+    np.testing.assert_allclose(back[:, axis], mesh.extent[side, axis])
 
 
 def test_materials_are_colors_and_pictures(models: tuple[Model, ...]) -> None:
@@ -60,7 +56,7 @@ def test_one_in_four_makes_of_a_kind_is_held_out_and_none_of_a_kind_of_fewer_tha
     assert {model.kind.name for model in others} == {model.kind.name for model in models}
 
 
-def test_a_model_of_many_faces_is_simplified_and_keeps_its_size(
+def test_a_model_of_many_faces_is_simplified_and_keeps_its_size_and_materials(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     n = 60
@@ -69,18 +65,25 @@ def test_a_model_of_many_faces_is_simplified_and_keeps_its_size(
     row = n + 1
     corners = [x * row + y + 1 for x in range(n) for y in range(n)]
     faces = [f"f {at} {at + 1} {at + row + 1} {at + row}" for at in corners]
-    text = "\n".join([*vertices, *faces])
+    text = "\n".join(["mtllib box.mtl", *vertices, "usemtl back", *faces[: 10 * n], "usemtl body", *faces[10 * n :]])
     path = write_library(tmp_path / "fine.sh3f", catalogue(MODELS[:1]), {"box/box.obj": text.encode()})
     monkeypatch.setattr(library, "MAX_FACES", 1000)
     (model,) = load_libraries([path])
     assert 100 < len(model.mesh.faces) <= 1000
     np.testing.assert_allclose(np.ptp(model.mesh.extent, axis=0), model.size, rtol=0.05)
+    has_picture = np.array([texture is not None for texture in model.mesh.textures])[model.mesh.materials]
+    assert has_picture.mean() == pytest.approx(1 / 6, abs=0.05)
 
 
 def test_no_word_stands_for_two_kinds() -> None:
     words = [word for kind in kinds().values() for word in kind.words]
     assert len(words) == len(set(words))
     assert all(word == word.strip().lower() for word in words)
+
+
+def test_an_id_says_more_of_the_kind_than_a_category_and_that_more_than_a_name() -> None:
+    known = kind_of("", "Chair", ""), kind_of("", "Chair", "Office"), kind_of("Scopia#bowl", "Chair", "Office")
+    assert [kind and kind.name for kind in known] == ["chair", "office chair", "bowl"]
 
 
 WRONG = {

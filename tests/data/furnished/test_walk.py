@@ -7,18 +7,16 @@ import numpy as np
 import pytest
 from furniture import write_library
 
+from gsencoder.app import main as cli
+from gsencoder.data.furnished import surfaces
 from gsencoder.data.furnished.kinds import STRUCTURE
-from gsencoder.data.furnished.library import Model, load_libraries
-from gsencoder.data.furnished.plan import Home, plan_home
-from gsencoder.data.furnished.surfaces import Surfaces
-from gsencoder.data.furnished.walk import WalkConfig, furnished_scene, furnished_splat, objects_of
+from gsencoder.data.furnished.library import Model, select_makes
+from gsencoder.data.furnished.plan import Home, Item, plan_home, pose
+from gsencoder.data.furnished.shapes import mesh_of_quads
+from gsencoder.data.furnished.surfaces import Look, Surfaces
+from gsencoder.data.furnished.walk import WalkConfig, _commonest, furnished_scene, furnished_splat, objects_of
 
 SMALL = WalkConfig(views=6, width=64, noise=0.0, drift=0.0)
-
-
-@pytest.fixture(scope="module")
-def models(tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, ...]:
-    return load_libraries([write_library(tmp_path_factory.mktemp("library") / "test.sh3f")])
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +30,6 @@ def rng() -> np.random.Generator:
 
 def test_each_pixel_lies_in_the_box_of_its_object(home: Home) -> None:
     scene = furnished_scene(home, "room", SMALL, rng())
-    assert scene.views is not None
-    assert scene.views.depths is not None
-    assert scene.views.instances is not None
     boxes = {each.id: (each.aabb_min, each.aabb_max) for each in scene.objects}
     for view in range(len(scene.views)):
         depth, labels = scene.views.depths[view], scene.views.instances[view]
@@ -48,16 +43,14 @@ def test_each_pixel_lies_in_the_box_of_its_object(home: Home) -> None:
 
 
 def test_cameras_keep_away_from_things_and_stay_in_the_room(home: Home) -> None:
-    scene = furnished_scene(home, "room", SMALL, rng())
-    assert scene.views is not None
-    centers = scene.views.cameras.centers
+    centers = furnished_scene(home, "room", SMALL, rng()).views.cameras.centers
     (_, area, height), surfaces = home.rooms[0], Surfaces(home, rng())
     assert (surfaces.distance(centers) > 0.2).all()
     assert (centers > [area.x0, area.y0, 0]).all()
     assert (centers < [area.x1, area.y1, height]).all()
 
 
-def test_without_noise_gaussians_lie_on_the_surfaces_that_they_are_named_for(home: Home) -> None:
+def test_without_noise_gaussians_lie_on_the_surfaces_that_most_of_their_pixels_show(home: Home) -> None:
     voxel = 0.05
     splat = furnished_splat(home, SMALL, voxel, rng())
     surfaces = Surfaces(home, rng())
@@ -68,31 +61,54 @@ def test_without_noise_gaussians_lie_on_the_surfaces_that_they_are_named_for(hom
         assert (means > objects[item].aabb_min - voxel).all()
         assert (means < objects[item].aabb_max + voxel).all()
     assert {home.items[item].kind for item in np.unique(splat.items)} >= set(STRUCTURE)
+    assert _commonest(3 * np.array([2, 7, 2, 2]) + [0, 2, 1, 1], 3, np.array([7, 2])).tolist() == [2, 1]
+
+
+def test_a_splat_of_a_drifting_walk_lies_where_its_poses_say(home: Home) -> None:
+    exact, moved = (furnished_splat(home, replace(SMALL, drift=drift), 0.05, rng()) for drift in (0.0, 0.4))
+    assert np.linalg.norm(exact.cameras.centers - moved.cameras.centers, axis=1).max() == pytest.approx(0.4, rel=1e-3)
+    assert Surfaces(home, rng()).distance(moved.means).max() > 0.2
+
+
+def test_what_is_seen_of_a_picture_is_its_pixel_with_rows_from_the_top(home, monkeypatch):
+    pictures = np.random.default_rng(0).random((2, 4, 6, 3)).astype(np.float32)
+    monkeypatch.setattr(surfaces, "looks_of", lambda item, *_: [Look(pictures[int(item.kind)], 1)])
+    monkeypatch.setattr(Surfaces, "_shade", lambda self, points, normals: np.ones((len(points), 1), np.float32))
+    square = mesh_of_quads([np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)])
+    items = [Item(kind=str(n), matrix=pose(2.0 * n, 0.0, 0.0, 0.0, np.ones(3)), shape=square) for n in range(2)]
+    at, item = rng().uniform(0, 1, (400, 2)), np.arange(400) % 2
+    rays = np.column_stack([at[:, 0] + 2 * item, at[:, 1], np.ones(400), np.tile([0, 0, -1], (400, 1))])
+    both = Surfaces(replace(home, items=tuple(items)), rng())
+    colors = both.cast(*np.split(rays.astype(np.float32), 2, axis=1)).colors
+    seen = pictures[item, ((1 - at[:, 1]) * 4).astype(int), (at[:, 0] * 6).astype(int)]
+    assert (np.abs(colors - seen).max(axis=1) < 1e-6).mean() > 0.98
+
+
+def test_the_command_takes_the_makes_and_the_types_that_it_is_told(models, tmp_path, monkeypatch):
+    given, library = [], write_library(tmp_path / "test.sh3f")
+    monkeypatch.setattr("gsencoder.app.commands.rooms.plan_home", lambda *each: given.append(each) or plan_home(*each))
+    options = ("makes=held_out", "types=[bathroom]", "walk.views=3", "walk.width=32", "quiet=true")
+    assert cli.main(["rooms", str(library), *options, f"out={tmp_path / 'homes'}"]) == 0
+    ((used, _, types),) = given
+    assert [model.id for model in used] == [model.id for model in select_makes(models, "held_out")]
+    assert types == ("bathroom",)
 
 
 def test_noise_grows_with_the_square_of_depth_and_drift_moves_poses(home: Home) -> None:
-    exact = furnished_scene(home, "room", SMALL, rng())
-    noisy = furnished_scene(home, "room", replace(SMALL, noise=1.0, drift=0.05), rng())
-    assert exact.views is not None
-    assert noisy.views is not None
-    assert exact.views.depths is not None
-    assert noisy.views.depths is not None
-    true, measured = np.stack(list(exact.views.depths)), np.stack(list(noisy.views.depths))
+    configs = (SMALL, replace(SMALL, noise=1.0, drift=0.05))
+    exact, noisy = (furnished_scene(home, "room", each, rng()).views for each in configs)
+    true, measured = np.stack(list(exact.depths)), np.stack(list(noisy.depths))
     both = (true > 0) & (measured > 0)
     relative = (measured - true)[both] / (0.0014 * true[both] ** 2)
     assert relative.std() == pytest.approx(1, rel=0.1)
     assert 0.005 < ((true > 0) & (measured == 0)).mean() < 0.3
-    moved = np.linalg.norm(exact.views.cameras.centers - noisy.views.cameras.centers, axis=1)
+    moved = np.linalg.norm(exact.cameras.centers - noisy.cameras.centers, axis=1)
     assert moved.max() == pytest.approx(0.05, rel=1e-3)
 
 
 def test_light_and_materials_are_drawn_for_each_home_and_a_seed_gives_the_same(home: Home) -> None:
-    images = []
-    for seed in (5, 5, 6):
-        scene = furnished_scene(home, "room", SMALL, np.random.default_rng(seed))
-        assert scene.views is not None
-        assert scene.views.images is not None
-        images.append(np.stack(list(scene.views.images)))
+    scenes = [furnished_scene(home, "room", SMALL, np.random.default_rng(seed)) for seed in (5, 5, 6)]
+    images = [np.stack(list(scene.views.images)) for scene in scenes]
     assert (images[0] == images[1]).all()
     assert np.abs(images[0].astype(int) - images[2]).mean() > 5
 

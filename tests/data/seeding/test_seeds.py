@@ -14,6 +14,7 @@ from textured_box import box_cameras, box_views
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.depth import room_frame, seed_from_depth
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, seed, seed_from_mesh, seed_from_points, seed_from_tsdf
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
@@ -198,6 +199,9 @@ class TestSeed:
         cloud = Scene(name="x", sfm_points=points, sfm_colors=np.zeros((300, 3), np.uint8))
         with pytest.warns(SceneWarning, match="median nearest-neighbor distance"):
             assert 100 < len(seed(cloud)) <= 300
+        grid = 4 * np.stack((*np.divmod(np.arange(400, dtype=np.float32), 20), np.zeros(400, np.float32)), axis=1)
+        with pytest.warns(SceneWarning, match=r"lie 4 units apart, which is taken for 0\.02 m, so a unit for 0\.005 m"):
+            assert unit_of(Scene(name="x", gaussians=seed_from_points(grid, np.zeros_like(grid, np.uint8)))) == 0.005
 
     def test_a_mesh_without_a_unit_takes_its_voxel_from_the_cameras(self, tmp_path):
         trimesh.creation.box((100.0, 100.0, 100.0)).export(tmp_path / "box.ply")
