@@ -6,7 +6,7 @@ of samples of a step: a process, or a data worker of it, makes the rooms of its 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,8 @@ STORED = 0.5
 NOISE, DRIFT = (0.2, 2.5), 0.03
 """Smallest and largest noise of the sensor, as in `WalkConfig`, and largest drift, metres: from clean meshes to seeds
 of a first depth camera's frames, whose walls are 2 cm thick (rms)."""
+LEAST_VIEWS = 0.4
+"""Smallest share of the views of a walk that sees most things: people scan a part of a room, or in haste."""
 DENSITIES = (0.6, 1.4)
 """Smallest and largest distance of the seeds, in voxels of the encoder."""
 
@@ -149,6 +151,7 @@ class RoomStream:
         home = plan_home(self._models, rng, ("storage room",) if rng.random() < STORED else ())
         noise = NOISE[0] * (NOISE[1] / NOISE[0]) ** rng.random()
         walk = splat_walk(home, noise=noise, drift=float(rng.uniform(0, DRIFT)))
+        walk = replace(walk, views=max(1, round(walk.views * rng.uniform(LEAST_VIEWS, 1))))
         splat = furnished_splat(home, walk, float(rng.uniform(*DENSITIES)) * self._voxel, rng)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
         return LabeledPart(name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook)

@@ -21,6 +21,8 @@ CLEARANCE = 0.25
 """Smallest distance of the camera from a surface, metres."""
 _GRAZING = 0.12
 """Cosine between ray and normal below which a sensor measures no depth."""
+_EXPOSURE = 0.1
+"""Standard deviation of the logarithm of a frame's exposure, which a camera sets for each."""
 _TILT = 0.25
 """Error of the normals of a structured-light camera: of seeds of a kitchen the cosine with the plane around is 0.8."""
 
@@ -189,7 +191,8 @@ def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random
         seen = (believed.centers[view] + rays * frame.depth[kept][:, None]).astype(np.float32)
         tilted = frame.normals[kept] + rng.normal(0, _TILT * config.noise, (len(seen), 3))
         normals = (tilted / np.linalg.norm(tilted, axis=1, keepdims=True)).astype(np.float32)
-        grid.add(seen, normals, frame.image[kept])
+        exposure = np.exp(rng.normal(0, _EXPOSURE))
+        grid.add(seen, normals, np.minimum(frame.image[kept] * exposure, 255).astype(np.uint8))
         keys.append(_voxel_keys(seen, voxel) * len(home.items) + frame.items[kept])
     samples = grid.samples()
     if not len(samples.points):
