@@ -26,7 +26,7 @@ from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.encode import Encoder
 from gsencoder.infer.relevancy import relevancy
 from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
-from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
+from gsencoder.text.vocabulary import OnnxTextConfig, Words, vocabulary_of
 
 
 def classes_of_kinds(classes: list[str]) -> list[set[int]]:
@@ -35,6 +35,13 @@ def classes_of_kinds(classes: list[str]) -> list[set[int]]:
         {number for number, name in enumerate(classes) if name in (*kind.words, *kind.hypernyms) and name != "building"}
         for kind in kinds().values()
     ]
+
+
+def segmenter() -> tuple[SegmenterTeacher, Words]:
+    """The segmenter, and the words of its classes."""
+    network = OnnxSegmenterOptions(scale=1.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+    words = vocabulary_of(OnnxTextConfig(model="minilm_l6", pooling="mean"))
+    return SegmenterTeacher(SegmenterConfig(model="mosaic_ade31.onnx", onnx=network), words), words
 
 
 def main() -> None:
@@ -48,9 +55,7 @@ def main() -> None:
     encoder = Encoder.load(arguments.weights)
     words, space = encoder.words, next(iter(encoder.tables))
     assert words is not None
-    network = OnnxSegmenterOptions(scale=1.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
-    vocabulary = vocabulary_of(OnnxTextConfig(model="minilm_l6", pooling="mean"))
-    teacher = SegmenterTeacher(SegmenterConfig(model="mosaic_ade31.onnx", onnx=network), vocabulary)
+    teacher, vocabulary = segmenter()
     scene, _ = with_up(with_gaussians(load_scene(arguments.scene), SeedConfig(voxel=arguments.voxel)))
     assert scene.gaussians is not None
     fused = fuse(scene, teacher).features

@@ -67,10 +67,12 @@ def walk_cameras(home: Home, surfaces: Surfaces, config: WalkConfig, rng: np.ran
     for _, area, height in home.rooms:
         count = max(3, round(config.views * area.size / floor))
         lower, upper = [area.x0 + 0.2, area.y0 + 0.2, 1.1], [area.x1 - 0.2, area.y1 - 0.2, min(1.8, height - 0.3)]
-        points = rng.uniform(lower, upper, (12 * count, 3))
-        free = points[surfaces.distance(points) > CLEARANCE][:count]
+        candidates, free = rng.uniform(lower, upper, (6, 2 * count, 3)), np.empty((0, 3))
+        for points in candidates:
+            if len(free) < count:
+                free = np.concatenate([free, points[surfaces.distance(points) > CLEARANCE]])[:count]
         if not len(free):
-            free = np.array([[*points[0, :2], min(height - 0.3, 2.0)]])
+            free = np.array([[*candidates[0, 0, :2], min(height - 0.3, 2.0)]])
         centers.append(_tour(free))
         targets.append(rng.uniform([area.x0, area.y0, 0.0], [area.x1, area.y1, 0.8 * height], free.shape))
     path = np.concatenate(centers)
