@@ -67,7 +67,7 @@ def test_those_of_several_teachers_have_the_settings_of_their_experiment() -> No
             assert value == {**constants, **settings["train"]}[name], name
     assert settings["augment"]
     # These were added since.
-    later = {"recolor", "spread", "lift", "fade", "swell"}
+    later = {"recolor", "spread", "lift", "fade"}
     assert made_with["augment"] == {name: value for name, value in asdict(Augmentation()).items() if name not in later}
 
 

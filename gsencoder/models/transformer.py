@@ -5,8 +5,7 @@ The input channels do not depend on where the scene lies, nor on the sign and th
 quaternion and three scales describe the same ellipsoid in 48 ways, and a network would have to learn that they are
 equal. The logarithm of the covariance has one value for each ellipsoid, is linear in log-scales, and stays within a few
 units for scales from 1e-9 to 1e4. `rotation` is its trace-free part and `scale` the sorted log-scales, so that either
-can be left out. `normal` alone says which way a flat Gaussian faces, and nothing of its size and thickness, in which
-a scan, a reconstruction and a rendered mesh differ.
+can be left out.
 """
 
 import math
@@ -429,7 +428,7 @@ def _make_blocks(config: TransformerConfig, channels: int, rates: list[float]) -
     return nn.ModuleList(Block(channels, heads, drop_path=rate) for rate in rates)
 
 
-Attribute = Literal["offset", "color", "opacity", "scale", "rotation", "normal", "height"]
+Attribute = Literal["offset", "color", "opacity", "scale", "rotation", "height"]
 
 ATTRIBUTE_CHANNELS: dict[Attribute, int] = {
     "offset": 3,
@@ -437,7 +436,6 @@ ATTRIBUTE_CHANNELS: dict[Attribute, int] = {
     "opacity": 1,
     "scale": 3,
     "rotation": 6,
-    "normal": 6,
     "height": 2,
 }
 
@@ -466,10 +464,9 @@ def embed(
     offset: position of the center in its voxel, −1 to 1. color: degree-0 color, −1 for black to 1 for white, clamped to
     ±2. opacity: −1 to 1. scale: ¼ of log(scale / voxel), largest first. rotation: ¼ of the six distinct entries of
     R diag(log s − mean log s) Rᵀ, the off-diagonal ones times √2, so that distances between inputs are Frobenius
-    distances between matrices. normal: these entries of R diag(w) Rᵀ − I/3, where w is the softmax of −4·log s, so of
-    n nᵀ − I/3 for a flat Gaussian with normal n, and 0 for a ball. height: z above the floor in 50 voxels and in 5,
-    less 1, clamped to ±2 and ±1; z must be up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). The
-    voxel, in world units, is a tensor in an exported graph, where it is an input.
+    distances between matrices. height: z above the floor in 50 voxels and in 5, less 1, clamped to ±2 and ±1; z must be
+    up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). The voxel, in world units, is a tensor in an
+    exported graph, where it is an input.
     """
     channels: list[Tensor] = []
     log_scales = torch.log(scales.double() / voxel).clamp(-MAX_ABS_LOG_SCALE, MAX_ABS_LOG_SCALE).to(means.dtype)
@@ -487,8 +484,6 @@ def embed(
             channels.append((cells / 5 - 1).clamp(-1, 1).to(means.dtype))
         elif name == "scale":
             channels.append(log_scales.sort(dim=1, descending=True).values / 4)
-        elif name == "normal":
-            channels.append(_symmetric_matrix(quats, torch.softmax(-4 * log_scales, dim=1) - 1 / 3))
         else:
             channels.append(_symmetric_matrix(quats, log_scales - log_scales.mean(dim=1, keepdim=True)) / 4)
     return torch.cat(channels, dim=1)

@@ -29,7 +29,7 @@ NOISE, DRIFT = (0.2, 2.5), 0.03
 of a first depth camera's frames, whose walls are 2 cm thick (rms)."""
 LEAST_VIEWS = 0.4
 """Smallest share of the views of a walk that sees most things: people scan a part of a room, or in haste."""
-DENSITIES = (0.6, 1.4)
+DENSITIES = (0.45, 1.4)
 """Smallest and largest distance of the seeds, in voxels of the encoder."""
 
 
@@ -152,6 +152,7 @@ class RoomStream:
         noise = NOISE[0] * (NOISE[1] / NOISE[0]) ** rng.random()
         walk = splat_walk(home, noise=noise, drift=float(rng.uniform(0, DRIFT)))
         walk = replace(walk, views=max(1, round(walk.views * rng.uniform(LEAST_VIEWS, 1))))
-        splat = furnished_splat(home, walk, float(rng.uniform(*DENSITIES)) * self._voxel, rng)
+        spacing = DENSITIES[0] * (DENSITIES[1] / DENSITIES[0]) ** rng.random() * self._voxel
+        splat = furnished_splat(home, walk, spacing, rng)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
         return LabeledPart(name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook)

@@ -188,7 +188,6 @@ class Augmentation:
     spread: float = 0.15  # standard deviation of the logarithm of a common factor of scales, and of one for each axis
     lift: float = 0.15  # probability that the floor is believed anywhere, up to FAR voxels from where it is
     fade: float = 0.3  # largest share of its opacity that a Gaussian loses
-    swell: float = 1.0  # largest power by which a Gaussian's scales approach its longest; its axes turn as much
 
 
 FAR, NEAR_FLOOR = 70.0, 2.0
@@ -225,16 +224,11 @@ def augment(
     relit = _recolored(turned.sh, rng, config.recolor) * gain + ((black_shift + noise) / SH_C0)[:, None]
     factors = rng.normal(rng.normal(0, config.spread), config.spread, turned.scales.shape)
     kept = 1 - rng.uniform(0, config.fade) * rng.random(len(turned.opacities))
-    # Seeds of a noisy cloud are thick, and their normals wrong.
-    swollen = rng.uniform(0, config.swell) * rng.random((len(turned.scales), 1))
-    scales = turned.scales ** (1 - swollen) * turned.scales.max(axis=1, keepdims=True) ** swollen
-    quats = turned.quats + 0.3 * swollen * rng.normal(size=turned.quats.shape)
     return replace(
         turned,
-        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
         means=(turned.means + shift).astype(np.float32),
         sh=relit.astype(np.float32),
-        scales=(scales * np.exp(factors)).astype(np.float32),
+        scales=(turned.scales * np.exp(factors)).astype(np.float32),
         opacities=(turned.opacities * kept).astype(np.float32),
     )
 
