@@ -10,12 +10,14 @@ names that agree where the encoder's name, too, is one that the segmenter has a 
 
 import argparse
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from errors import one_line_errors
 from furnished import names_of
 from json_option import add_json_option, write_figures
+from segmenter import mosaic
 
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.furnished.kinds import kinds
@@ -25,23 +27,17 @@ from gsencoder.data.up import with_up
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.encode import Encoder
 from gsencoder.infer.relevancy import relevancy
-from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
-from gsencoder.text.vocabulary import OnnxTextConfig, Words, vocabulary_of
 
 
-def classes_of_kinds(classes: list[str]) -> list[set[int]]:
-    """For each kind the classes that name it: by its name, a synonym or a broader word."""
-    return [
-        {number for number, name in enumerate(classes) if name in (*kind.words, *kind.hypernyms) and name != "building"}
-        for kind in kinds().values()
-    ]
-
-
-def segmenter() -> tuple[SegmenterTeacher, Words]:
-    """The segmenter, and the words of its classes."""
-    network = OnnxSegmenterOptions(scale=1.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
-    words = vocabulary_of(OnnxTextConfig(model="minilm_l6", pooling="mean"))
-    return SegmenterTeacher(SegmenterConfig(model="mosaic_ade31.onnx", onnx=network), words), words
+def classes_of_kinds(classes: Sequence[str]) -> np.ndarray:
+    """Which classes [C] name each kind [K]: by its name, a synonym or a broader word. "building" names no thing of a
+    room, but is a broader word for walls."""
+    return np.array(
+        [
+            [name in (*kind.words, *kind.hypernyms) and name != "building" for name in classes]
+            for kind in kinds().values()
+        ]
+    )
 
 
 def main() -> None:
@@ -55,23 +51,22 @@ def main() -> None:
     encoder = Encoder.load(arguments.weights)
     words, space = encoder.words, next(iter(encoder.tables))
     assert words is not None
-    teacher, vocabulary = segmenter()
+    teacher, vocabulary = mosaic()
     scene, _ = with_up(with_gaussians(load_scene(arguments.scene), SeedConfig(voxel=arguments.voxel)))
     assert scene.gaussians is not None
     fused = fuse(scene, teacher).features
     classes = relevancy(fused, teacher.table, vocabulary.mean).argmax(axis=0)
     encoded = encoder.encode(scene.gaussians, space=space, metres_per_unit=scene.metres_per_unit or 1.0, up=scene.up)
     names = names_of(encoded, words)
-    agreeing = classes_of_kinds(list(teacher.names))
-    in_both = sorted(set().union(*agreeing))
-    compared = (fused.weights > 0) & np.isin(classes, in_both)
-    agrees = np.array([number in agreeing[kind] for number, kind in zip(classes, names, strict=True)])
-    comparable = compared & np.isin(names, [kind for kind, found in enumerate(agreeing) if found])
+    belongs = classes_of_kinds(teacher.names)
+    compared = (fused.weights > 0) & belongs.any(axis=0)[classes]
+    agrees = belongs[names, classes]
+    comparable = compared & belongs.any(axis=1)[names]
     figures = {"agreement": agrees[comparable].mean(), "of_all": agrees[compared].mean()}
     listed = ", ".join(f"{name} {share:.3f}" for name, share in figures.items())
     print(f"{compared.sum():,} of {len(names):,} Gaussians compared: {listed}")
     every = list(kinds())
-    for number in in_both:
+    for number in np.flatnonzero(belongs.any(axis=0)):
         rows = compared & (classes == number)
         if rows.mean() > 0.001:
             common = np.bincount(names[rows], minlength=len(every))

@@ -24,10 +24,17 @@ from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.fusion.fuse import fuse
 from gsencoder.render import blend
 from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
-from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
+from gsencoder.text.vocabulary import OnnxTextConfig, Words, vocabulary_of
 
 MIN_ALPHA = 0.5
 """Pixels of a render below this alpha are not compared."""
+
+
+def mosaic() -> tuple[SegmenterTeacher, Words]:
+    """The segmenter, and the text encoder of its classes."""
+    network = OnnxSegmenterOptions(scale=1.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+    words = vocabulary_of(OnnxTextConfig(model="minilm_l6", pooling="mean"))
+    return SegmenterTeacher(SegmenterConfig(model="mosaic_ade31.onnx", onnx=network), words), words
 
 
 def red_fronts(image: np.ndarray) -> np.ndarray:
@@ -48,9 +55,7 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
     os.environ.setdefault("GSENCODER_MODELS", str(Path(options.scene).parents[1] / "models"))
-    network = OnnxSegmenterOptions(scale=1.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
-    words = vocabulary_of(OnnxTextConfig(model="minilm_l6", pooling="mean"))
-    teacher = SegmenterTeacher(SegmenterConfig(model="mosaic_ade31.onnx", onnx=network), words)
+    teacher, words = mosaic()
     scene = load_scene(options.scene)
     views = scene.views
     left_out = np.arange(0, len(views), options.every)

@@ -18,10 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from agreement import classes_of_kinds, segmenter
+from agreement import classes_of_kinds
 from errors import one_line_errors, positive
 from furnished import VOXEL, names_of, summary
 from json_option import add_json_option, write_figures
+from segmenter import mosaic
 
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.furnished.kinds import kinds
@@ -76,11 +77,10 @@ def main() -> None:
     add_json_option(parser)
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
-    encoder, (teacher, _) = Encoder.load(arguments.weights), segmenter()
+    encoder, (teacher, _) = Encoder.load(arguments.weights), mosaic()
     words, space = encoder.words, next(iter(encoder.tables))
     assert words is not None
-    of_kinds = classes_of_kinds(list(teacher.names))
-    belongs = np.array([[number in classes for number in range(len(teacher.names))] for classes in of_kinds])
+    belongs = classes_of_kinds(teacher.names)
     shares: dict[str, list[float]] = {"teacher": [], "encoder": [], "together": []}
     named: dict[str, np.ndarray] = {}
     if arguments.regions:
