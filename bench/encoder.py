@@ -31,7 +31,13 @@ from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.plan import plan_cloud
-from gsencoder.models.transformer import _append_zero_row, _gather_neighborhoods, _row_blocks
+from gsencoder.models.transformer import (
+    _append_zero_row,
+    _by_cells,
+    _cell_neighbors,
+    _gather_neighborhoods,
+    _row_blocks,
+)
 from gsencoder.types import FeatureSpace, Gaussians
 
 CHANNELS = 64
@@ -94,9 +100,13 @@ class Recorded(TorchDispatchMode):
         name = function.overloadpacket.__name__
         if name == "convolve":
             x, neighbors, weight = args
-            padded, matrix = _append_zero_row(x), weight.flatten(0, 1)
+            padded, whole = _append_zero_row(x), weight.flatten(0, 1)
             for rows in _row_blocks(len(x), x.device):
-                self.products.append((torch.mm, (_gather_neighborhoods(padded, neighbors[rows]), matrix), {}))
+                if _by_cells(x):
+                    pairs = zip(weight, _cell_neighbors(neighbors[rows], len(x)), strict=True)
+                    self.products += [(torch.mm, (x[cells], matrix), {}) for matrix, (_, cells) in pairs]
+                else:
+                    self.products.append((torch.mm, (_gather_neighborhoods(padded, neighbors[rows]), whole), {}))
         if name in PRODUCTS:
 
             def copy(value: Any) -> Any:

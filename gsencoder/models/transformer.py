@@ -9,6 +9,7 @@ can be left out.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -32,11 +33,11 @@ OCCUPIED: dict[int, int] = {3: 10, 5: 28}
 """Cells of a neighborhood that are occupied on a surface, approximately, by the edge of the neighborhood."""
 
 CPU_BLOCK_ROWS = 8192
-"""Rows whose neighborhoods are gathered together on a CPU, few enough that what they gather stays in its cache."""
+"""Rows whose neighbors are gathered together on a CPU, so that memory does not grow with the scene."""
 
-FEW_CELLS = 9
-"""A block of tokens that needs at most one in so many cells of a neighborhood multiplies these alone: isolated tokens,
-and lines of them. It changes rounding only; surfaces, which need a third of the cells, keep every bit."""
+MANY_CHANNELS = 48
+"""Input channels from which a convolution on a CPU multiplies the neighbors that exist, cell by cell, rather than whole
+neighborhoods. On a surface two cells in three are empty, but to find the others costs more than few channels save."""
 
 
 class NeighborConv(nn.Module):
@@ -72,16 +73,17 @@ def convolve_reference(
 # Operators of their own, which `gsencoder.infer.onnx.export` translates to standard ONNX operators.
 @torch.library.custom_op("gsencoder::convolve", mutates_args=())
 def convolve(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
-    """`convolve_reference`, computed in blocks of rows, on a CPU without the cells that no row of a block needs."""
+    """`convolve_reference` in blocks of rows, summed in float32 at least."""
+    if _by_cells(x):
+        total = x.new_zeros(len(x), weight.shape[2], dtype=torch.promote_types(x.dtype, torch.float32))
+        for rows in _row_blocks(len(x), x.device):
+            for matrix, (present, cells) in zip(weight, _cell_neighbors(neighbors[rows], len(x)), strict=True):
+                total[rows].index_add_(0, present, (x.index_select(0, cells) @ matrix).to(total.dtype))
+        return total.to(x.dtype)
     padded, matrix = _append_zero_row(x), weight.flatten(0, 1)
     out = x.new_empty(len(x), matrix.shape[1])
     for rows in _row_blocks(len(x), x.device):
-        cells, columns = neighbors[rows], matrix
-        if x.device.type == "cpu":
-            occupied = cells.amin(dim=0) < len(x)
-            if FEW_CELLS * int(occupied.sum()) <= len(occupied):
-                cells, columns = cells[:, occupied], weight[occupied].flatten(0, 1)
-        torch.mm(_gather_neighborhoods(padded, cells), columns, out=out[rows])
+        torch.mm(_gather_neighborhoods(padded, neighbors[rows]), matrix, out=out[rows])
     return out
 
 
@@ -96,12 +98,18 @@ def convolve_weight_gradient(x: Tensor, neighbors: Tensor, grad: Tensor) -> Tens
 
     It is summed in float32 at least.
     """
+    total = x.new_zeros(
+        neighbors.shape[1], x.shape[1], grad.shape[1], dtype=torch.promote_types(x.dtype, torch.float32)
+    )
+    if _by_cells(x):
+        for rows in _row_blocks(len(x), x.device):
+            for sums, (present, cells) in zip(total, _cell_neighbors(neighbors[rows], len(x)), strict=True):
+                sums += x.index_select(0, cells).T @ grad[rows].index_select(0, present)
+        return total.to(x.dtype)
     padded = _append_zero_row(x)
-    shape = (neighbors.shape[1], x.shape[1], grad.shape[1])
-    total = x.new_zeros(shape, dtype=torch.promote_types(x.dtype, torch.float32)).flatten(0, 1)
     for rows in _row_blocks(len(x), x.device):
-        total += _gather_neighborhoods(padded, neighbors[rows]).T @ grad[rows]
-    return total.view(shape).to(x.dtype)
+        total.flatten(0, 1).add_(_gather_neighborhoods(padded, neighbors[rows]).T @ grad[rows])
+    return total.to(x.dtype)
 
 
 @convolve_weight_gradient.register_fake
@@ -123,6 +131,17 @@ def _gradients(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | No
 
 
 convolve.register_autograd(_gradients, setup_context=_save_inputs)
+
+
+def _by_cells(x: Tensor) -> bool:
+    return x.device.type == "cpu" and x.shape[1] >= MANY_CHANNELS
+
+
+def _cell_neighbors(neighbors: Tensor, tokens: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """For each cell of the neighborhood the rows that have a neighbor there, and the neighbors."""
+    for column in neighbors.T.contiguous():
+        rows = torch.nonzero(column < tokens).squeeze(1)
+        yield rows, column.index_select(0, rows)
 
 
 def _append_zero_row(x: Tensor) -> Tensor:

@@ -75,7 +75,10 @@ def test_on_a_full_grid_the_convolution_is_a_dense_one_with_zeros_around(size: i
 @pytest.mark.parametrize("size", [3, 5])
 @pytest.mark.parametrize("count", [1, 5, 300])
 @pytest.mark.parametrize("block_rows", [64, 8192])
-def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(size, count, block_rows, monkeypatch):
+@pytest.mark.parametrize("many", [1, 4])
+def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(size, count, block_rows, many, monkeypatch):
+    """Of whole neighborhoods, and cell by cell; the gradient of the latter's input has channels for either."""
+    monkeypatch.setattr(transformer, "MANY_CHANNELS", many)
     monkeypatch.setattr(transformer, "CPU_BLOCK_ROWS", block_rows)
     table = neighbor_table(distinct_cells(count, 8), size)  # type: ignore[arg-type]
     layer = NeighborConv(3, 5, size).double()  # type: ignore[arg-type]
@@ -87,23 +90,3 @@ def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(size,
     plain_grads = torch.autograd.grad(plain, [x, layer.weight, layer.bias], upstream)
     for mine, theirs in zip(ours_grads, plain_grads, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("line", [False, True])
-def test_cells_that_no_token_of_a_block_needs_are_left_out_and_nothing_but_rounding_changes(line, monkeypatch):
-    """Isolated tokens, or a line of them, after a block of neighbors."""
-    monkeypatch.setattr(transformer, "CPU_BLOCK_ROWS", 64)
-    dense = torch.cartesian_prod(*[torch.arange(4)] * 3)
-    apart = torch.arange(100, 200)[:, None] * torch.tensor([1 if line else 3, 0, 0])
-    table, widths = neighbor_table(torch.cat((dense, apart))), []
-    plain_gather = transformer._gather_neighborhoods
-
-    def gather(padded: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
-        widths.append(cells.shape[1])
-        return plain_gather(padded, cells)
-
-    monkeypatch.setattr(transformer, "_gather_neighborhoods", gather)
-    layer, x = NeighborConv(3, 5).double(), torch.randn(len(table), 3, dtype=torch.float64)
-    plain = convolve_reference(x, table, layer.weight) + layer.bias
-    torch.testing.assert_close(layer(x, table), plain, rtol=1e-12, atol=1e-12)
-    assert widths == [27, 3, 3] if line else [27, 1, 1]
