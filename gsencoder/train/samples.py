@@ -64,7 +64,7 @@ class RoomsConfig(CheckedConfig):
         (), "furniture libraries (.sh3f) for rooms that are made while the training runs; empty = no such rooms"
     )
     share: float = option(0.75, "share of the samples that is from these rooms where scenes are given, too", gt=0, le=1)
-    samples: int = option(64, "number of samples from each room", ge=1, le=1_000_000)
+    samples: int = option(128, "number of samples from each room", ge=1, le=1_000_000)
     without: tuple[str, ...] = option(
         (), "kinds that no room has, to judge an encoder on kinds that it never saw", names=True
     )

@@ -34,6 +34,8 @@ MAX_FACES = 100_000
 """Largest number of triangles of a model; larger ones are simplified."""
 MAX_TEXTURE = 256
 """Largest side of a texture, pixels: finer than Gaussians of 2 cm show."""
+GLASS = 0.6
+"""Opacity of a material below which it is glass."""
 MAX_FILE = 1 << 28
 """Largest size of an unpacked file of a library, bytes."""
 
@@ -198,7 +200,10 @@ def _read_member(file: Path, name: str) -> bytes:
 
 
 def _read_mesh(file: Path, name: str) -> Mesh:
-    """Reads an OBJ file of a library with its materials; models of very many faces are simplified."""
+    """Reads an OBJ file of a library with its materials; models of very many faces are simplified.
+
+    Panes are left out, since depth sensors see through them; a model that is all of glass keeps its faces.
+    """
     import trimesh
 
     with zipfile.ZipFile(file) as archive, warnings.catch_warnings():
@@ -218,6 +223,7 @@ def _read_mesh(file: Path, name: str) -> Mesh:
     parts = [each for each in scene.dump() if isinstance(each, trimesh.Trimesh) and len(each.faces)]
     if not parts:
         raise InputError(f"{name}: has no faces")
+    parts = [each for each in parts if not _is_glass(each)] or parts
     first = np.cumsum([0, *(len(each.vertices) for each in parts)])
     looks = [_look(each) for each in parts]
     mesh = Mesh(
@@ -259,6 +265,15 @@ def _uvs(part: Any) -> Float32[np.ndarray, "F 3 2"]:
     if uv is None or len(uv) != len(part.vertices):
         return np.zeros((len(part.faces), 3, 2), np.float32)
     return np.nan_to_num(np.asarray(uv, np.float32))[part.faces]
+
+
+def _is_glass(part: Any) -> bool:
+    """Whether a part's material is transparent; d is its opacity in MTL files."""
+    opacity = (getattr(getattr(part.visual, "material", None), "kwargs", None) or {}).get("d", "1")
+    try:
+        return float(opacity if isinstance(opacity, str) else opacity[-1]) < GLASS
+    except (TypeError, ValueError, IndexError):
+        return False
 
 
 def _look(part: Any) -> tuple[Float32[np.ndarray, "3"], UInt8[np.ndarray, "h w 3"] | None]:

@@ -38,6 +38,16 @@ def test_materials_are_colors_and_pictures(models: tuple[Model, ...]) -> None:
     np.testing.assert_allclose(by_texture[True], [0, 0, 1], atol=0.01)
 
 
+@pytest.mark.parametrize(("back", "faces"), [("0.3", 10), ("0.9", 12), ("clear", 12)])
+def test_panes_of_a_model_are_left_out_and_one_all_of_glass_is_whole(back: str, faces: int, tmp_path: Path) -> None:
+    materials = {"box/box.mtl": f"newmtl body\nKd 1 0 0\nnewmtl back\nKd 1 1 1\nd {back}\n".encode()}
+    (model,) = load_libraries([write_library(tmp_path / "panes.sh3f", catalogue(MODELS[:1]), materials)])
+    assert len(model.mesh.faces) == faces
+    every = {"box/box.mtl": b"newmtl body\nKd 1 0 0\nd 0.2\nnewmtl back\nKd 1 1 1\nd 0.2\n"}
+    (model,) = load_libraries([write_library(tmp_path / "glass.sh3f", catalogue(MODELS[:1]), every)])
+    assert len(model.mesh.faces) == 12
+
+
 def test_what_no_room_has_is_left_out(models: tuple[Model, ...]) -> None:
     assert len(models) == len(MODELS) - 1
     assert all(model.name != "Tractor" for model in models)
