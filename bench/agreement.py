@@ -63,15 +63,15 @@ def main() -> None:
     agrees = belongs[names, classes]
     comparable = compared & belongs.any(axis=1)[names]
     figures = {"agreement": agrees[comparable].mean(), "of_all": agrees[compared].mean()}
-    listed = ", ".join(f"{name} {share:.3f}" for name, share in figures.items())
-    print(f"{compared.sum():,} of {len(names):,} Gaussians compared: {listed}")
+    line = ", ".join(f"{name} {share:.3f}" for name, share in figures.items())
+    print(f"{compared.sum():,} of {len(names):,} Gaussians compared: {line}")
     every = list(kinds())
     for number in np.flatnonzero(belongs.any(axis=0)):
         rows = compared & (classes == number)
         if rows.mean() > 0.001:
             common = np.bincount(names[rows], minlength=len(every))
-            listed = ", ".join(f"{every[kind]} {common[kind] / rows.sum():.2f}" for kind in np.argsort(-common)[:5])
-            print(f"{teacher.names[number]:10} {rows.sum():7,} Gaussians, {agrees[rows].mean():.3f} agree: {listed}")
+            line = ", ".join(f"{every[kind]} {common[kind] / rows.sum():.2f}" for kind in np.argsort(-common)[:5])
+            print(f"{teacher.names[number]:10} {rows.sum():7,} Gaussians, {agrees[rows].mean():.3f} agree: {line}")
     write_figures(arguments.json, figures)
 
 

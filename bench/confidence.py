@@ -122,8 +122,8 @@ def main() -> None:
     fitted = [number for number, source in enumerate(sources) if source != "known"]
 
     def fit_without(left_out: set[int]) -> tuple[float, float, float]:
-        kept = [number for number in fitted if number not in left_out]
-        return fit([sources[number] for number in kept], [scenes[number] for number in kept])
+        used = [number for number in fitted if number not in left_out]
+        return fit([sources[number] for number in used], [scenes[number] for number in used])
 
     homes = [number for number in fitted if sources[number] == HOME]
     folds = [set(homes[::2]), set(homes[1::2])]

@@ -82,13 +82,13 @@ def main() -> None:
     assert words is not None
     belongs = classes_of_kinds(teacher.names)
     shares: dict[str, list[float]] = {"teacher": [], "encoder": [], "together": []}
-    named: dict[str, np.ndarray] = {}
+    names_by_source: dict[str, np.ndarray] = {}
     if arguments.regions:
         scenes = regions(arguments.source, arguments.regions)
     else:
         scenes = homes(arguments.source, arguments.seed, arguments.homes)
     for scene, truth in scenes:
-        if not arguments.regions or not named:
+        if not arguments.regions or not names_by_source:
             assert scene.gaussians is not None
             fused = fuse(scene, teacher).features
             unit = scene.metres_per_unit or 1.0
@@ -96,13 +96,15 @@ def main() -> None:
             both, by_encoder = surer_features(
                 fused, encoded, words.encode(words.trained or words.names), words.mean, bias=arguments.bias
             )
-            named = {title: names_of(each, words) for title, each in zip(shares, (fused, encoded, both), strict=True)}
+            names_by_source = {
+                title: names_of(each, words) for title, each in zip(shares, (fused, encoded, both), strict=True)
+            }
             print(f"{by_encoder.mean():.2f} of the Gaussians have the encoder's features", flush=True)
         compared = (truth >= 0) & belongs[truth].any(axis=1) & (fused.weights > 0)
-        for title, names in named.items():
+        for title, names in names_by_source.items():
             shares[title].append(float((belongs[names] & belongs[truth])[compared].any(axis=1).mean()))
-        listed = ", ".join(f"{title} {values[-1]:.3f}" for title, values in shares.items())
-        print(f"{scene.name}: {compared.sum():,} Gaussians, {listed}", flush=True)
+        line = ", ".join(f"{title} {values[-1]:.3f}" for title, values in shares.items())
+        print(f"{scene.name}: {compared.sum():,} Gaussians, {line}", flush=True)
     figures = {title: summary(values) for title, values in shares.items()}
     print(", ".join(f"{title} {each['mean']:.3f} ± {each['standard_error']:.3f}" for title, each in figures.items()))
     write_figures(arguments.json, {title: each["mean"] for title, each in figures.items()})

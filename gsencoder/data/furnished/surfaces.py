@@ -123,8 +123,8 @@ class Surfaces:
             start = points + 0.004 * normals
             lit = np.flatnonzero(power > 0.01)
             rays = np.concatenate([start[lit], toward[lit]], axis=1).astype(np.float32)
-            free = ~self._scene.test_occlusions(self._tensor(rays), tfar=0.97, nthreads=1).numpy()
-            shade[lit] += power[lit] * free
+            unobstructed = ~self._scene.test_occlusions(self._tensor(rays), tfar=0.97, nthreads=1).numpy()
+            shade[lit] += power[lit] * unobstructed
         return shade[:, None] * light.gain.astype(np.float32)
 
 
@@ -217,10 +217,10 @@ def _smooth(rng: np.random.Generator, cells: int) -> Float32[np.ndarray, "t t"]:
     """Smooth noise in [−1, 1] that repeats."""
     coarse = rng.uniform(-1, 1, (cells, cells))
     at = np.arange(TEXELS) * cells / TEXELS
-    low, part = np.floor(at).astype(int), at % 1
+    low, fraction = np.floor(at).astype(int), at % 1
     high = (low + 1) % cells
-    rows = coarse[low] * (1 - part)[:, None] + coarse[high] * part[:, None]
-    return (rows[:, low] * (1 - part) + rows[:, high] * part).astype(np.float32)
+    rows = coarse[low] * (1 - fraction)[:, None] + coarse[high] * fraction[:, None]
+    return (rows[:, low] * (1 - fraction) + rows[:, high] * fraction).astype(np.float32)
 
 
 def _noise(color: np.ndarray, rng: np.random.Generator) -> Look:

@@ -67,14 +67,14 @@ def walk_cameras(home: Home, surfaces: Surfaces, config: WalkConfig, rng: np.ran
     for _, area, height in home.rooms:
         count = max(3, round(config.views * area.size / floor))
         lower, upper = [area.x0 + 0.2, area.y0 + 0.2, 1.1], [area.x1 - 0.2, area.y1 - 0.2, min(1.8, height - 0.3)]
-        candidates, free = rng.uniform(lower, upper, (6, 2 * count, 3)), np.empty((0, 3))
+        candidates, places = rng.uniform(lower, upper, (6, 2 * count, 3)), np.empty((0, 3))
         for points in candidates:
-            if len(free) < count:
-                free = np.concatenate([free, points[surfaces.distance(points) > CLEARANCE]])[:count]
-        if not len(free):
-            free = np.array([[*candidates[0, 0, :2], min(height - 0.3, 2.0)]])
-        centers.append(_tour(free))
-        targets.append(rng.uniform([area.x0, area.y0, 0.0], [area.x1, area.y1, 0.8 * height], free.shape))
+            if len(places) < count:
+                places = np.concatenate([places, points[surfaces.distance(points) > CLEARANCE]])[:count]
+        if not len(places):
+            places = np.array([[*candidates[0, 0, :2], min(height - 0.3, 2.0)]])
+        centers.append(_tour(places))
+        targets.append(rng.uniform([area.x0, area.y0, 0.0], [area.x1, area.y1, 0.8 * height], places.shape))
     path = np.concatenate(centers)
     forward = np.concatenate(targets) - path
     # Not straight up or down.
@@ -188,14 +188,14 @@ def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random
     keys = []
     for view in range(len(cameras)):
         frame = frame_of(surfaces, cameras, view, config, rng)
-        kept = frame.depth > 0
-        rays = believed.rays(view)[kept]
-        seen = (believed.centers[view] + rays * frame.depth[kept][:, None]).astype(np.float32)
-        tilted = frame.normals[kept] + rng.normal(0, _TILT * config.noise, (len(seen), 3))
+        measured = frame.depth > 0
+        rays = believed.rays(view)[measured]
+        seen = (believed.centers[view] + rays * frame.depth[measured][:, None]).astype(np.float32)
+        tilted = frame.normals[measured] + rng.normal(0, _TILT * config.noise, (len(seen), 3))
         normals = (tilted / np.linalg.norm(tilted, axis=1, keepdims=True)).astype(np.float32)
         exposure = np.exp(rng.normal(0, _EXPOSURE))
-        grid.add(seen, normals, np.minimum(frame.image[kept] * exposure, 255).astype(np.uint8))
-        keys.append(_voxel_keys(seen, voxel) * len(home.items) + frame.items[kept])
+        grid.add(seen, normals, np.minimum(frame.image[measured] * exposure, 255).astype(np.uint8))
+        keys.append(_voxel_keys(seen, voxel) * len(home.items) + frame.items[measured])
     samples = grid.samples()
     if not len(samples.points):
         raise InputError("furnished: the walk sees nothing")
