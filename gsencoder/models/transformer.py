@@ -134,6 +134,7 @@ convolve.register_autograd(_gradients, setup_context=_save_inputs)
 
 
 def _by_cells(x: Tensor) -> bool:
+    """Whether to multiply cell by cell; see `MANY_CHANNELS`."""
     return x.device.type == "cpu" and x.shape[1] >= MANY_CHANNELS
 
 
