@@ -52,6 +52,27 @@ def encoded(rooms: Path, trained: Path) -> Path:
     return out
 
 
+def test_a_training_starts_from_weights_of_another_and_refuses_those_of_another_network(
+    rooms, trained, tmp_path, capsys
+):
+    words = [
+        str(rooms / "room_0"),
+        "teacher=labels",
+        f"teacher.words={rooms / 'words.safetensors'}",
+        *QUICK[1:2],
+        *QUICK[3:],
+    ]
+    still = ["train.steps=1", "train.learning_rate=1e-9", f"init={trained}", "quiet=true", f"out={tmp_path / 'out'}"]
+    assert cli.main(["train", *words, *still]) == 0
+    before, after = load_weights(trained)[0].state_dict(), load_weights(tmp_path / "out")[0].state_dict()
+    for name in ("stem.weight", "head_norm.weight", "head.of_teacher.0.0.weight"):
+        np.testing.assert_allclose(after[name], before[name], atol=1e-3)
+    assert load_weights(tmp_path / "out")[2]["settings"]["init"] == str(trained)
+    assert "init: house was made with model." in refusal(
+        capsys, "train", *words, "init=house", f"out={tmp_path / 'other'}"
+    )
+
+
 def test_training_leaves_one_encoder_with_the_spaces_words_and_scores_of_both_teachers(rooms, trained):
     summary = json.loads((trained / "summary.json").read_text())
     assert any("teacher labels: 1 of 3 scenes lack" in str(warning) for warning in summary["warnings"])

@@ -22,7 +22,7 @@ from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import ahead
 from gsencoder.data.up import upright_gaussians
-from gsencoder.fusion.basis import field_error, to_coordinates
+from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
 from gsencoder.models.grid import cut_scene_curves
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, find_weights
@@ -236,7 +236,7 @@ def name_odds(
         restored: coordinates in the basis, or vectors, of Gaussians.
     """
     vectors = np.unique(names, axis=0)
-    codes = outputs.standardize(vectors if outputs.basis is None else to_coordinates(outputs.basis, vectors))
+    codes = outputs.project(vectors)
     odds = np.empty(len(restored), np.float32)
     for start in range(0, len(restored), NAME_ROWS):
         block = outputs.standardize(restored[start : start + NAME_ROWS])

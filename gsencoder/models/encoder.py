@@ -1,8 +1,9 @@
 """The Gaussian encoder: a network from raw Gaussian attributes to one feature per Gaussian (SplatDistill sec. 3.3),
 and its weights on disk: a safetensors file with parameters, configuration of the network and output spaces."""
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.core.archive import open_archive, write_archive
-from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.settings import check_limits, first_difference, option
 from gsencoder.models.grid import SceneCurves
 from gsencoder.models.output_space import OutputSpaces, find_weights, output_spaces_parts, read_output_spaces
 from gsencoder.models.plan import CloudPlan, KernelSize, Plan, join_plans, plan_cloud
@@ -108,6 +109,12 @@ class GaussianEncoder(nn.Module):
         else:
             features = self.head(self.head_norm(x))
         return features.to(torch.promote_types(features.dtype, torch.float32))
+
+    def head_parameters(self, number: int, columns: slice) -> tuple[Tensor, ...]:
+        """Weights and biases of the layers that give a teacher's columns, the last layer's at the end."""
+        if isinstance(self.head, Projectors):
+            return tuple(self.head.of_teacher[number].parameters())
+        return self.head.weight[columns], self.head.bias[columns]
 
 
 class Projectors(nn.Module):
@@ -217,6 +224,37 @@ def load_weights(source: str | Path, option: str = "weights") -> tuple[GaussianE
         made_by: dict[str, Any] = file.value("made_by", dict)
     encoder.load_state_dict(state, assign=True)
     return encoder.eval(), outputs, made_by
+
+
+@torch.no_grad()
+def start_from(encoder: GaussianEncoder, outputs: OutputSpaces, source: str | Path) -> None:
+    """Gives an encoder the parameters of trained weights. Its last layers are converted to its own output spaces, whose
+    means, scales and bases may be others, so that it predicts the same features; a teacher that the weights do not
+    predict keeps its projector, with a warning."""
+    trained, spaces, _ = load_weights(source, "init")
+    theirs, ours = (
+        asdict(replace(each.config, transformer=replace(each.config.transformer, drop_path=0.0)))
+        for each in (trained, encoder)
+    )
+    if theirs != ours:
+        difference = first_difference({"model": theirs}, {"model": ours})
+        raise InputError(f"init: {source} was made with {difference}; give the settings that it was made with")
+    state = {name: value for name, value in trained.state_dict().items() if not name.startswith("head.")}
+    encoder.load_state_dict(state, strict=False)
+    for number, (teacher, target) in enumerate(outputs.by_teacher.items()):
+        same = [each for each, other in enumerate(spaces.by_teacher.values()) if other.space == target.space]
+        if not same:
+            message = f"init: {source} has no features of {teacher}, whose projector starts at random"
+            warnings.warn(message, SceneWarning, stacklevel=2)
+            continue
+        name = list(spaces)[same[0]]
+        *hidden, weight, bias = trained.head_parameters(same[0], spaces.columns[name])
+        # The conversion is affine, so that those of 0, of the bias and of each column give it.
+        rows = torch.cat((torch.zeros_like(bias)[None], bias[None], weight.T)).numpy()
+        converted = torch.from_numpy(target.project(spaces[name].features(spaces[name].restore(rows)).decode()))
+        values = (*hidden, (converted[2:] - converted[0]).T, converted[1])
+        for parameter, value in zip(encoder.head_parameters(number, outputs.columns[teacher]), values, strict=True):
+            parameter.copy_(value)
 
 
 def _read_config(values: dict[str, Any]) -> EncoderConfig:

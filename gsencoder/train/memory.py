@@ -33,7 +33,6 @@ from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.core.settings import CheckedConfig, first_difference, option
 from gsencoder.data.scene_arrays import bank_parts, read_bank
 from gsencoder.data.splats.files import fingerprint
-from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.checkpoint import CachedTeacher, upright
 from gsencoder.fusion.fuse import fuse
 from gsencoder.memory.attention import MemoryAttention, random_projection
@@ -64,9 +63,7 @@ class MemoryScene:
     @property
     def values(self) -> Float32[np.ndarray, "M channels"]:
         """The components in the units of the outputs."""
-        basis = self.outputs.basis
-        rows = self.bank.components if basis is None else to_coordinates(basis, self.bank.components)
-        return self.outputs.standardize(rows)
+        return self.outputs.project(self.bank.components)
 
     def fused_features(self) -> GaussianFeatures:
         """The fused features, as they were stored."""

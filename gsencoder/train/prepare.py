@@ -326,10 +326,10 @@ def _pool_map(
         counts = np.bincount(cell_of * count + codes.ravel() + 1, minlength=height * width * count)
         shares = counts.reshape(height * width, count) / factor**2
         valid = shares[:, 0] == 0
-        vectors = (shares[:, 1:] @ _standardize(feature_map.table, outputs)).astype(np.float32)
+        vectors = (shares[:, 1:] @ outputs.project(feature_map.table)).astype(np.float32)
     else:
-        dense = feature_map.rows().reshape(feature_map.height, feature_map.width, -1)
-        grid = _standardize(dense, outputs)[: height * factor, : width * factor]
+        dense = outputs.project(feature_map.rows()).reshape(feature_map.height, feature_map.width, -1)
+        grid = dense[: height * factor, : width * factor]
         vectors = grid.reshape(height, factor, width, factor, -1).mean(axis=(1, 3)).reshape(height * width, -1)
         valid = np.isfinite(vectors).all(axis=1)
     like = FeatureMap(
@@ -339,13 +339,6 @@ def _pool_map(
         space=feature_map.space,
     )
     return np.where(valid[:, None], vectors, np.float32(0)), valid, like
-
-
-def _standardize(vectors: np.ndarray, outputs: OutputSpace) -> np.ndarray:
-    """Projects vectors [..., D] to the basis, if there is one, and converts them to standard units."""
-    flat = vectors.reshape(-1, vectors.shape[-1])
-    coordinates = to_coordinates(outputs.basis, flat) if outputs.basis is not None else flat
-    return outputs.standardize(coordinates).reshape(*vectors.shape[:-1], outputs.channels)
 
 
 def add_scene(

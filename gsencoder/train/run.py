@@ -16,9 +16,8 @@ from gsencoder.core.files import plain
 from gsencoder.core.process import Device, ProcessRank, Track, untracked
 from gsencoder.core.settings import option
 from gsencoder.core.threads import threads_of_torch
-from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.measured_heads import heads_digest
-from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, start_from
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words, closed_table
@@ -91,6 +90,11 @@ class TrainConfig(SourceConfig):
         names=True,
     )
     model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
+    init: str = option(
+        "",
+        "weights to start from, made with the same model= settings: a folder or file written by `train`, or the name "
+        "of an encoder that comes with gsencoder; empty = random parameters",
+    )
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: bool = option(True, "turn, mirror, scale, shift, thin and relight samples at random")
     recolor: float = option(
@@ -243,6 +247,8 @@ def fit(
         check_agreement("the prepared scenes", digest_of(digests))
     torch.manual_seed(config.train.seed)
     encoder = GaussianEncoder(config.model, outputs.widths)
+    if config.init:
+        start_from(encoder, outputs, config.init)
     trainer = encoder_trainer(
         encoder,
         SampleDataset([TrainingScene(_parts(datasets, name)) for name in training], recipe, stream),
@@ -277,8 +283,7 @@ def room_stream(
     space, number = outputs[name], list(config.teachers_by_name).index(name)
     codebook = recipe.teachers[number].codebook
     vectors = words[name].encode(list(kinds()))
-    coordinates = vectors if space.basis is None else to_coordinates(space.basis, vectors)
-    codes = nearest_codes(codebook, space.standardize(coordinates))
+    codes = nearest_codes(codebook, space.project(vectors))
     return RoomStream(
         config.rooms,
         codebook,
@@ -346,7 +351,10 @@ def resume_settings(
     """What a run must share with the one that it resumes besides the settings of the loop, as JSON values; `heads` is
     the digest of the render loss's heads."""
     return {
-        **{name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "recolor", "loss", "rooms")},
+        **{
+            name: plain(getattr(config, name))
+            for name in ("model", "init", "sampling", "augment", "recolor", "loss", "rooms")
+        },
         # The order, which a mapping does not have when it is compared, is that of the columns.
         "teachers": list(datasets),
         "spaces": {name: dataset.fingerprint() for name, dataset in datasets.items()},

@@ -10,11 +10,11 @@ import torch
 from archives import header_of, rewrite
 from training_scenes import SMALL
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer.encode import Encoder
-from gsencoder.models.encoder import GaussianEncoder, load_weights, save_weights
+from gsencoder.models.encoder import GaussianEncoder, encoder_inputs, load_weights, save_weights, start_from
 from gsencoder.models.output_space import DEFAULT_WEIGHTS, SHIPPED_WEIGHTS, OutputSpace, OutputSpaces, find_weights
-from gsencoder.types import FeatureBasis, FeatureSpace
+from gsencoder.types import FeatureBasis, FeatureSpace, Gaussians
 
 SPACE = FeatureSpace(name="s", channels=6, teacher="labels", text_encoder="t")
 
@@ -151,3 +151,54 @@ def test_words_of_another_encoder_beside_the_weights_are_refused(tmp_path: Path)
         InputError, match=r"words beside the encoder are of .* \(384 channels\), and its space labels has 512"
     ):
         Encoder.load(str(tmp_path))
+
+
+def predicted(network: GaussianEncoder, spaces: OutputSpaces) -> np.ndarray:
+    """Features [N, 6] of the labels that an encoder gives some Gaussians."""
+    attributes, opacities, plan = encoder_inputs(line_of_gaussians(), SMALL, SMALL.voxel)
+    with torch.no_grad():
+        standard = network.eval()(attributes, opacities, network.join([plan])).numpy()[:, spaces.columns["labels"]]
+    return spaces["labels"].features(spaces["labels"].restore(standard)).decode()
+
+
+def line_of_gaussians() -> Gaussians:
+    rng = np.random.default_rng(3)
+    return Gaussians(
+        means=rng.uniform(0, 1, (50, 3)).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (50, 1)),
+        scales=np.full((50, 3), 0.02, np.float32),
+        opacities=np.full(50, 0.9, np.float32),
+        sh=rng.normal(size=(50, 1, 3)).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("projector", [0, 8])
+@pytest.mark.parametrize("basis", [False, True])
+def test_an_encoder_that_starts_from_weights_predicts_their_features_in_units_of_its_own(
+    projector: int, basis: bool, tmp_path: Path
+) -> None:
+    config = replace(SMALL, projector=projector)
+    side = OutputSpace(space=replace(SPACE, name="sides", channels=3), mean=np.ones(3, np.float32), scale=2.0)
+    theirs = outputs(basis)
+    torch.manual_seed(1)
+    trained = GaussianEncoder(config, theirs.widths)
+    save_weights(tmp_path / "e.safetensors", trained, theirs, {})
+    labels = OutputSpace(space=SPACE, mean=np.arange(6, dtype=np.float32), scale=0.3)
+    ours = OutputSpaces(by_teacher={"sides": side, "labels": labels})
+    torch.manual_seed(2)
+    started = GaussianEncoder(replace(config, transformer=replace(SMALL.transformer, drop_path=0.5)), ours.widths)
+    before = [each.clone() for each in started.head_parameters(0, ours.columns["sides"])]
+    with pytest.warns(SceneWarning, match="has no features of sides, whose projector starts at random"):
+        start_from(started, ours, tmp_path / "e.safetensors")
+    expected = predicted(trained, theirs)
+    assert expected.std(axis=0).max() > 0.01
+    np.testing.assert_allclose(predicted(started, ours), expected, atol=1e-5)
+    for parameter, value in zip(started.head_parameters(0, ours.columns["sides"]), before, strict=True):
+        torch.testing.assert_close(parameter, value, rtol=0, atol=0)
+
+
+def test_an_encoder_does_not_start_from_weights_of_another_network(tmp_path: Path) -> None:
+    save_weights(tmp_path / "e.safetensors", encoder(outputs(False)), outputs(False), {})
+    other = GaussianEncoder(replace(SMALL, voxel=0.05), outputs(False).widths)
+    with pytest.raises(InputError, match=r"made with model.voxel=0.1, and this run asks model.voxel=0.05; give the"):
+        start_from(other, outputs(False), tmp_path / "e.safetensors")

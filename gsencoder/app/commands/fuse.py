@@ -106,7 +106,11 @@ def run(config: FuseCommandConfig, run: Run) -> None:
         if config.teacher.name != "auto":
             words_once(config.teacher, config.text)  # What cannot be read is an error before any scene is.
             heads = config.teacher.read_heads(config.teacher.stored_heads, "teacher.heads")
-        encoder = load_encoder(config.encoder, config.device) if config.encoder else None
+        encoder = None
+        if config.encoder:
+            from gsencoder.infer.encode import Encoder  # with torch
+
+            encoder = Encoder.load(config.encoder, config.device)
     outputs = load_output_spaces(config.basis, "basis") if config.basis else None
 
     def one(path: Path, out: Path, run: Run) -> None:
@@ -178,12 +182,6 @@ def run(config: FuseCommandConfig, run: Run) -> None:
         )
 
     run.scenes(paths, "features", one)
-
-
-def load_encoder(weights: str, device: Device) -> "Encoder":
-    from gsencoder.infer.encode import Encoder  # with torch
-
-    return Encoder.load(weights, device)
 
 
 def with_encoder(fusion: Fusion, encoder: "Encoder", scene: Scene, run: Run) -> tuple[Fusion, TextTable]:
