@@ -35,7 +35,7 @@ from json_option import add_json_option, write_figures
 from gsencoder.core.process import memory_growth
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.fusion.basis import Moments, field_error, fit_basis, to_coordinates
+from gsencoder.fusion.basis import Moments, field_error, fit_basis
 from gsencoder.fusion.lift import VisibilityConfig, center_matrix, ray_pixels
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.blend_cpu import grid_lattice
@@ -194,7 +194,7 @@ def lift_matrix(problem: Problem, matrices: list[Blend], basis: FeatureBasis | N
     weights = np.zeros((len(problem.gaussians), 1), np.float32)
     for b, one in zip(matrices, problem.maps, strict=True):
         maps = rows_of(one)
-        maps = to_coordinates(basis, maps) if basis is not None else maps
+        maps = basis.coordinates(maps) if basis is not None else maps
         b.lift_into(torch.from_numpy(maps), torch.from_numpy(sums))
         b.lift_into(torch.ones(len(maps), 1), torch.from_numpy(weights))
     np.divide(sums, weights, out=sums, where=weights > 0)

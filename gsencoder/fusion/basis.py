@@ -143,11 +143,6 @@ def table_basis(
     return _leading(wide, lengths**2, vectors, space, energy=energy, max_rank=0)
 
 
-def to_coordinates(basis: FeatureBasis, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:
-    """Coordinates of vectors: (x − mean) @ componentsᵀ."""
-    return ((vectors - basis.mean) @ basis.components.T).astype(np.float32)
-
-
 def basis_figures(basis: FeatureBasis | None, rank: int) -> dict[str, int | float]:
     """The rank of a basis, and the share of the energy that it keeps of the vectors that it was fitted to; `rank` is
     the number of columns of the features, which without a basis are all channels."""
@@ -208,7 +203,7 @@ class ProjectionSums:
     ) -> None:
         """Adds vectors of the space, each `counts` times; vectors that are the mean itself have no direction and are
         left out."""
-        explained = np.square(to_coordinates(basis, vectors), dtype=np.float64).sum(axis=1)
+        explained = np.square(basis.coordinates(vectors), dtype=np.float64).sum(axis=1)
         total = np.square(vectors - basis.mean, dtype=np.float64).sum(axis=1)
         count = np.where(total > 0, np.ones(len(vectors)) if counts is None else counts, 0)
         # Rounding may make a projection longer than its vector.

@@ -14,7 +14,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.process import timed
 from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import kernel, parallel
-from gsencoder.fusion.basis import Moments, distinct_rows, to_coordinates
+from gsencoder.fusion.basis import Moments, distinct_rows
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.blend_cpu import Lattice, grid_lattice
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Gaussians, Views
@@ -245,7 +245,7 @@ class FeatureSums:
         return maps if scale.min() == 1 else maps * scale[:, None], scale
 
     def _in_columns(self, table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C columns"]:
-        return to_coordinates(self.basis, table) if self.basis is not None else table
+        return self.basis.coordinates(table) if self.basis is not None else table
 
     @timed("lift")
     def finish(self) -> tuple[Float32[np.ndarray, "N columns"], Float32[np.ndarray, " N"]]:

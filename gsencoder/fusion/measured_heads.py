@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, error_prefix
-from gsencoder.fusion.basis import WORST, to_coordinates
+from gsencoder.fusion.basis import WORST
 from gsencoder.models.output_space import check_heads_space, read_heads_space
 from gsencoder.teachers.base import PARTS, TEXT_KINDS, Head, Residual, default_part, split_name
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
@@ -97,7 +97,7 @@ def measure_heads(
             )
         cosines = np.ones(len(full))
         if basis is not None:
-            projected = (to_coordinates(basis, vectors) @ basis.components + basis.mean).astype(np.float32)
+            projected = (basis.coordinates(vectors) @ basis.components + basis.mean).astype(np.float32)
             cosines = _cosines(full, head_outputs(head, projected), mean)
         cosine, worst = float(cosines.mean()), float(np.quantile(cosines, WORST))
         measured.append(MeasuredHead(head=head, mean=mean, scale=scale, cells=len(full), cosine=cosine, worst=worst))

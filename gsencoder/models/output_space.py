@@ -23,7 +23,6 @@ from gsencoder.core.files import open_foreign
 from gsencoder.core.pretrained import find_file
 from gsencoder.data.scene_arrays import read_space, space_parts
 from gsencoder.data.scenes import kind_of_path
-from gsencoder.fusion.basis import to_coordinates
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 
@@ -76,7 +75,7 @@ class OutputSpace:
 
     def project(self, vectors: Float32[np.ndarray, "n D"]) -> Float32[np.ndarray, "n channels"]:
         """Converts vectors of the space to units of the outputs, through the basis if there is one."""
-        return self.standardize(vectors if self.basis is None else to_coordinates(self.basis, vectors))
+        return self.standardize(vectors if self.basis is None else self.basis.coordinates(vectors))
 
     def restore(self, outputs: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
         """Converts outputs back to coordinates or vectors; the inverse of `standardize`."""

@@ -29,7 +29,6 @@ from gsencoder.fusion.basis import (
     fit_basis,
     project_maps,
     table_basis,
-    to_coordinates,
 )
 from gsencoder.fusion.checkpoint import CachedTeacher, upright
 from gsencoder.fusion.fuse import FuseConfig, fuse
@@ -199,7 +198,7 @@ def dataset_space(
         mean = table.mean(axis=0) if mean is None else mean
         variance = np.square(table - mean, dtype=np.float64).sum(axis=1).mean()
         basis = table_basis(table, mean, space, energy=fusion.table_energy) if use_basis else None
-        coordinates = table if basis is None else to_coordinates(basis, table)
+        coordinates = table if basis is None else basis.coordinates(table)
     else:
         moments, kinds = Moments(space.channels), dict[str, None]()
         maps = sampled_maps(scenes, open_scene, config.basis_views, optional=optional)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Integer
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer
 
 from gsencoder.core.arrays import check_array, check_finite, check_rows, fail
 
@@ -131,6 +131,10 @@ class FeatureBasis:
     @property
     def rank(self) -> int:
         return len(self.components)
+
+    def coordinates(self, vectors: Float[np.ndarray, "*n D"]) -> Float32[np.ndarray, "*n R"]:
+        """Coordinates of vectors: (x − mean) @ componentsᵀ."""
+        return np.asarray((vectors - self.mean) @ self.components.T, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -15,7 +15,6 @@ from gsencoder.fusion.basis import (
     fit_basis,
     project_maps,
     table_basis,
-    to_coordinates,
 )
 from gsencoder.render import blend
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
@@ -111,7 +110,7 @@ def test_rendering_coordinates_then_decoding_equals_rendering_features(rng: np.r
     moments = moments_of(x)
     basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=1.0)
     b = blend(random_gaussians(200), front_camera(), patch=7)
-    rendered = b.render(torch.from_numpy(to_coordinates(basis, x))).numpy()
+    rendered = b.render(torch.from_numpy(basis.coordinates(x))).numpy()
     decoded = rendered @ basis.components + b.alpha.numpy()[:, None] * basis.mean
     np.testing.assert_allclose(decoded, b.render(torch.from_numpy(x)).numpy(), atol=1e-3)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.basis import table_basis, to_coordinates
+from gsencoder.fusion.basis import table_basis
 from gsencoder.infer.ensemble import surer_features
 from gsencoder.infer.relevancy import relevancy
 from gsencoder.types import FeatureSpace, GaussianFeatures
@@ -23,7 +23,7 @@ def features(
     if not basis:
         return GaussianFeatures(features=vectors, weights=weights, mean=MEAN, space=space)
     of_table = table_basis(vectors, MEAN, space, energy=1.0)
-    stored = to_coordinates(of_table, vectors)
+    stored = of_table.coordinates(vectors)
     return GaussianFeatures(features=stored, weights=weights, mean=of_table.mean, space=space, basis=of_table)
 
 

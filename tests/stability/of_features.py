@@ -12,7 +12,7 @@ from stability.of_rendering import blend_of, weights_of
 from stability.registry import routine, worst
 
 from gsencoder.core.arrays import round_columns
-from gsencoder.fusion.basis import Moments, fit_basis, to_coordinates
+from gsencoder.fusion.basis import Moments, fit_basis
 from gsencoder.fusion.checkpoint import read_map, write_map
 from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.quantize import compact
@@ -67,7 +67,7 @@ def decode_error(case: Case) -> float:
     moments = Moments(CHANNELS)
     moments.add(case.vectors)
     basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=0.9)
-    z = to_coordinates(basis, case.vectors)
+    z = basis.coordinates(case.vectors)
     features = replace(features_of(case), features=z, basis=basis, mean=basis.mean)
     axes = basis.components.astype(Wide)
     want = (case.vectors.astype(Wide) - basis.mean) @ axes.T @ axes + basis.mean
