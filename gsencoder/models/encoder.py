@@ -110,11 +110,11 @@ class GaussianEncoder(nn.Module):
             features = self.head(self.head_norm(x))
         return features.to(torch.promote_types(features.dtype, torch.float32))
 
-    def head_parameters(self, number: int, columns: slice) -> tuple[Tensor, ...]:
+    def head_parameters(self, outputs: OutputSpaces, teacher: str) -> tuple[Tensor, ...]:
         """Weights and biases of the layers that give a teacher's columns, the last layer's at the end."""
         if isinstance(self.head, Projectors):
-            return tuple(self.head.of_teacher[number].parameters())
-        return self.head.weight[columns], self.head.bias[columns]
+            return tuple(self.head.of_teacher[list(outputs).index(teacher)].parameters())
+        return self.head.weight[outputs.columns[teacher]], self.head.bias[outputs.columns[teacher]]
 
 
 class Projectors(nn.Module):
@@ -241,19 +241,18 @@ def start_from(encoder: GaussianEncoder, outputs: OutputSpaces, source: str | Pa
         raise InputError(f"init: {source} was made with {difference}; give the settings that it was made with")
     state = {name: value for name, value in trained.state_dict().items() if not name.startswith("head.")}
     encoder.load_state_dict(state, strict=False)
-    for number, (teacher, target) in enumerate(outputs.by_teacher.items()):
-        same = [each for each, other in enumerate(spaces.by_teacher.values()) if other.space == target.space]
-        if not same:
+    for teacher, target in outputs.by_teacher.items():
+        name = next((each for each in spaces if spaces[each].space == target.space), None)
+        if name is None:
             message = f"init: {source} has no features of {teacher}, whose projector starts at random"
             warnings.warn(message, SceneWarning, stacklevel=2)
             continue
-        name = list(spaces)[same[0]]
-        *hidden, weight, bias = trained.head_parameters(same[0], spaces.columns[name])
+        *hidden, weight, bias = trained.head_parameters(spaces, name)
         # The conversion is affine, so that those of 0, of the bias and of each column give it.
         rows = torch.cat((torch.zeros_like(bias)[None], bias[None], weight.T)).numpy()
         converted = torch.from_numpy(target.project(spaces[name].features(spaces[name].restore(rows)).decode()))
         values = (*hidden, (converted[2:] - converted[0]).T, converted[1])
-        for parameter, value in zip(encoder.head_parameters(number, outputs.columns[teacher]), values, strict=True):
+        for parameter, value in zip(encoder.head_parameters(outputs, teacher), values, strict=True):
             parameter.copy_(value)
 
 

@@ -247,7 +247,7 @@ def fit(
         check_agreement("the prepared scenes", digest_of(digests))
     torch.manual_seed(config.train.seed)
     encoder = GaussianEncoder(config.model, outputs.widths)
-    if config.init:
+    if config.init and not (work / TRAINING_CHECKPOINT_FILE).is_file():
         start_from(encoder, outputs, config.init)
     trainer = encoder_trainer(
         encoder,

@@ -401,7 +401,7 @@ class QueryMemory:
         values = self.bank.components
         if self.basis is not None:
             # The weights of the components sum to 1, so that coordinates are averaged as vectors are.
-            values = (values - self.basis.mean) @ self.basis.components.T
+            values = self.basis.coordinates(values)
         decoded = np.zeros((len(self), values.shape[1]), np.float32)
         seen = np.flatnonzero(self.weights > 0)
         decoded[seen] = self.attend(self.queries[seen], np.ascontiguousarray(values, np.float32))

@@ -187,13 +187,13 @@ def test_an_encoder_that_starts_from_weights_predicts_their_features_in_units_of
     ours = OutputSpaces(by_teacher={"sides": side, "labels": labels})
     torch.manual_seed(2)
     started = GaussianEncoder(replace(config, transformer=replace(SMALL.transformer, drop_path=0.5)), ours.widths)
-    before = [each.clone() for each in started.head_parameters(0, ours.columns["sides"])]
+    before = [each.clone() for each in started.head_parameters(ours, "sides")]
     with pytest.warns(SceneWarning, match="has no features of sides, whose projector starts at random"):
         start_from(started, ours, tmp_path / "e.safetensors")
     expected = predicted(trained, theirs)
     assert expected.std(axis=0).max() > 0.01
     np.testing.assert_allclose(predicted(started, ours), expected, atol=1e-5)
-    for parameter, value in zip(started.head_parameters(0, ours.columns["sides"]), before, strict=True):
+    for parameter, value in zip(started.head_parameters(ours, "sides"), before, strict=True):
         torch.testing.assert_close(parameter, value, rtol=0, atol=0)
 
 
