@@ -27,6 +27,8 @@ STORED = 0.5
 NOISE, DRIFT = (0.2, 2.5), 0.03
 """Smallest and largest noise of the sensor, as in `WalkConfig`, and largest drift, metres: from clean meshes to seeds
 of a first depth camera's frames, whose walls are 2 cm thick (rms)."""
+MADE = 0.5
+"""Share of makes of our own, of kinds of which there are such: from ten doors of a library no others are learned."""
 LEAST_VIEWS = 0.4
 """Smallest share of the views of a walk that sees most things: people scan a part of a room, or in haste."""
 DENSITIES = (0.45, 1.4)
@@ -148,7 +150,7 @@ class RoomStream:
 
     def labeled_part(self, rng: np.random.Generator, name: str) -> LabeledPart:
         """Makes a room, seen on a walk with a sensor of random quality, with seeds of random density."""
-        home = plan_home(self._models, rng, ("storage room",) if rng.random() < STORED else ())
+        home = plan_home(self._models, rng, ("storage room",) if rng.random() < STORED else (), made=MADE)
         noise = NOISE[0] * (NOISE[1] / NOISE[0]) ** rng.random()
         walk = splat_walk(home, noise=noise, drift=float(rng.uniform(0, DRIFT)))
         walk = replace(walk, views=max(1, round(walk.views * rng.uniform(LEAST_VIEWS, 1))))

@@ -58,13 +58,14 @@ class Mesh(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """A model of a library; lengths are metres.
+    """A make of a thing; lengths are metres.
 
     Attributes:
         id: unique among all libraries.
         size: width (x), depth (y) and height (z).
         elevation: of its lower side above the floor; 0 for what stands on it.
         top: height above its lower side at which things stand on it; None if nothing does.
+        finishes: the finish of each of its materials where these are drawn; empty if it has materials of its own.
     """
 
     id: str
@@ -73,13 +74,24 @@ class Model:
     size: tuple[float, float, float]
     elevation: float
     top: float | None
+    finishes: tuple[str, ...] = ()
+
+    @property
+    def mesh(self) -> Mesh:
+        """The triangles; x and y are centered and the lower side is at z = 0."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class LibraryModel(Model):
+    """A model of a library."""
+
     archive: Path
     file: str
     rotation: Float64[np.ndarray, "3 3"]
 
     @cached_property
     def mesh(self) -> Mesh:
-        """The triangles; x and y are centered and the lower side is at z = 0."""
         with error_prefix(f"{self.archive}: model {self.id}"):
             mesh = _read_mesh(self.archive, self.file)
             turned = mesh.vertices @ self.rotation.T
@@ -96,7 +108,7 @@ def load_libraries(paths: Sequence[str | Path]) -> tuple[Model, ...]:
     """Reads the catalogues of libraries, given as `.sh3f` files or folders of such. Models of kinds that rooms do not
     have are left out; warns of libraries in which no kind is known, such as those with names in another language."""
     files = [file for path in paths for file in _library_files(Path(path))]
-    models: dict[str, Model] = {}
+    models: dict[str, LibraryModel] = {}
     for file in files:
         found, indoors = _read_catalogue(file)
         if indoors and not found:
@@ -128,7 +140,7 @@ def _library_files(path: Path) -> list[Path]:
     return files
 
 
-def _read_catalogue(file: Path) -> tuple[list[Model], int]:
+def _read_catalogue(file: Path) -> tuple[list[LibraryModel], int]:
     """The models of one library whose kind is known, in the order of the catalogue, and the number of all models but
     those that do not stand in rooms."""
     with error_prefix(file):
@@ -148,7 +160,7 @@ def _read_catalogue(file: Path) -> tuple[list[Model], int]:
         return models, indoors
 
 
-def _model_of(file: Path, number: int, row: dict[str, str]) -> Model | None:
+def _model_of(file: Path, number: int, row: dict[str, str]) -> LibraryModel | None:
     name, category = row.get("name", ""), row.get("category", "")
     model_id = row.get("id") or f"{file.stem}#{number}"
     kind = kind_of(model_id, name, category)
@@ -165,7 +177,7 @@ def _model_of(file: Path, number: int, row: dict[str, str]) -> Model | None:
         if rotation.size != 9 or "model" not in row:
             raise InputError("expected a model's file, and a rotation of nine numbers if there is one")
         top = _metres(row, "dropOnTopElevation") if "dropOnTopElevation" in row else height
-        return Model(
+        return LibraryModel(
             id=model_id,
             name=name,
             kind=kind,

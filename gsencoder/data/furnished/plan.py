@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from gsencoder.data.furnished.kinds import ROOM_TYPES, RoomType, kinds
 from gsencoder.data.furnished.library import Mesh, Model
-from gsencoder.data.furnished.shapes import Rectangle, curtain, panels, slab
+from gsencoder.data.furnished.shapes import Rectangle, curtain, made_model, makes, panels, slab
 
 THICKNESS = 0.12
 """Of the walls between rooms."""
@@ -125,8 +125,11 @@ class Home:
     items: tuple[Item, ...]
 
 
-def plan_home(models: Sequence[Model], rng: np.random.Generator, types: Sequence[RoomType] = ()) -> Home:
-    """Plans a home of one to four rooms, or of the given types of rooms."""
+def plan_home(
+    models: Sequence[Model], rng: np.random.Generator, types: Sequence[RoomType] = (), *, made: float = 0.0
+) -> Home:
+    """Plans a home of one to four rooms, or of the given types of rooms; `made` is the share of makes of our own among
+    those of the kinds that have such."""
     if not types:
         count = int(rng.choice([1, 2, 3, 4], p=[0.6, 0.2, 0.12, 0.08]))
         types = [ROOM_TYPES[i] for i in rng.choice(len(ROOM_TYPES), count, p=_FREQUENCIES)]
@@ -144,7 +147,7 @@ def plan_home(models: Sequence[Model], rng: np.random.Generator, types: Sequence
     for model in models:
         by_kind.setdefault(model.kind.name, []).append(model)
     for room in rooms:
-        _Furnisher(room, by_kind, rng).furnish()
+        _Furnisher(room, by_kind, rng, made).furnish()
     items = [item for room in rooms for item in room.items]
     return Home(rooms=tuple((room.type, room.area, room.height) for room in rooms), items=tuple(items))
 
@@ -189,8 +192,8 @@ def _open_doorways(rooms: Sequence[Room], rng: np.random.Generator) -> None:
 class _Furnisher:
     """Furnishes one room."""
 
-    def __init__(self, room: Room, models: dict[str, list[Model]], rng: np.random.Generator) -> None:
-        self.room, self.models, self.rng = room, models, rng
+    def __init__(self, room: Room, models: dict[str, list[Model]], rng: np.random.Generator, made: float = 0.0) -> None:
+        self.room, self.models, self.rng, self.made = room, models, rng, made
         self.supports: list[tuple[Box, float]] = []
 
     def furnish(self) -> None:
@@ -215,9 +218,13 @@ class _Furnisher:
 
     # Placing one thing -------------------------------------------------------------------------------------------
 
-    def _draw(self, kind: str) -> Model | None:
-        """A model of a kind; None if there is none."""
-        found = self.models.get(kind, ())
+    def _draw(self, kind: str, suits: Callable[[Model], bool] = lambda _: True) -> Model | None:
+        """A model of a kind, or one of our own; None if there is none."""
+        found = [each for each in self.models.get(kind, ()) if suits(each)]
+        if self.made and found and kind in makes() and self.rng.random() < self.made:
+            made = made_model(kind, self.rng)
+            if suits(made):
+                return made
         return found[int(self.rng.integers(len(found)))] if found else None
 
     def _put(self, model: Model, x: float, y: float, z: float, yaw: float, scale: np.ndarray) -> Box | None:
@@ -433,15 +440,12 @@ class _Furnisher:
         runs: list[tuple[float, float]] = []
         start = at
         for kind in ("refrigerator", *self.rng.permutation(_KITCHEN_ROW).tolist()):
-            models = [
-                each
-                for each in self.models.get(kind, ())
-                if kind == "refrigerator" or (each.elevation < 0.2 and each.size[2] > 0.5)
-            ]
-            if not models or (kind == "refrigerator" and self.rng.random() < 0.3):
-                continue
-            model = models[int(self.rng.integers(len(models)))]
             low = kind != "refrigerator"
+            if not low and self.rng.random() < 0.3:
+                continue
+            model = self._draw(kind, lambda each: each.elevation < 0.2 and each.size[2] > 0.5)
+            if model is None:
+                continue
             scale = np.array([1.0, depth / model.size[1] if low else 1.0, height / model.size[2] if low else 1.0])
             width = model.size[0]
             if at + width > end:
@@ -463,11 +467,8 @@ class _Furnisher:
             self.supports.append((box, height + 0.036))
             where = begin
             while where < finish - 0.3 and self.rng.random() < 0.9:
-                upper = [each for each in self.models.get("kitchen cabinet", ()) if each.elevation > 0.8]
-                if not upper:
-                    break
-                model = upper[int(self.rng.integers(len(upper)))]
-                if where + model.size[0] > finish + 0.05:
+                model = self._draw("kitchen cabinet", lambda each: each.elevation > 0.8)
+                if model is None or where + model.size[0] > finish + 0.05:
                     break
                 self._wall("kitchen cabinet", at=(side, where + model.size[0] / 2), scale=np.ones(3), model=model)
                 where += model.size[0]

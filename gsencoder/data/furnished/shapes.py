@@ -1,12 +1,20 @@
-"""Shapes that no library has: walls with openings, floors, slabs and curtains, with texture coordinates in metres."""
+"""Shapes that no library has: walls with openings, floors, slabs and curtains, and makes of our own of furniture, doors
+and windows, with texture coordinates in metres."""
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.data.furnished.library import Mesh
+from gsencoder.data.furnished.kinds import kinds
+from gsencoder.data.furnished.library import Mesh, Model
 
 
 class Rectangle(NamedTuple):
@@ -26,9 +34,11 @@ class Rectangle(NamedTuple):
 Quad = Float64[np.ndarray, "4 3"]
 
 
-def mesh_of_quads(quads: Sequence[Quad]) -> Mesh:
-    """A mesh of one material; the texture coordinates of each quad are metres along its first two edges."""
+def mesh_of_quads(quads: Sequence[Quad], materials: Sequence[int] = ()) -> Mesh:
+    """A mesh of one material, or one for each quad; texture coordinates are metres along the first two edges."""
     corners = np.stack(quads)
+    of_quads = np.array(materials, np.int32) if len(materials) else np.zeros(len(corners), np.int32)
+    count = int(of_quads.max()) + 1
     along, up = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
     units = [each / np.maximum(np.linalg.norm(each, axis=1, keepdims=True), 1e-9) for each in (along, up)]
     # Coordinates continue from quad to quad of one plane, since they are measured from the world's origin.
@@ -38,9 +48,9 @@ def mesh_of_quads(quads: Sequence[Quad]) -> Mesh:
         vertices=corners.reshape(-1, 3).astype(np.float32),
         faces=(firsts + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3).astype(np.int32),
         uvs=np.stack([uvs[:, [0, 1, 2]], uvs[:, [0, 2, 3]]], axis=1).reshape(-1, 3, 2).astype(np.float32),
-        materials=np.zeros(2 * len(corners), np.int32),
-        colors=np.full((1, 3), 0.6, np.float32),
-        textures=(None,),
+        materials=np.repeat(of_quads, 2),
+        colors=np.full((count, 3), 0.6, np.float32),
+        textures=(None,) * count,
     )
 
 
@@ -145,3 +155,222 @@ def _reveal(
         _face(area, side, (at, 0.0, lower), (at, thickness, lower), (at, thickness, upper), (at, 0.0, upper))
         for at in (start, end)
     ]
+
+
+# Makes of our own --------------------------------------------------------------------------------------------------
+
+Range = tuple[float, float]
+Span = tuple[float, float]
+
+
+class Make(NamedTuple):
+    """How things of a kind vary: a body above feet, whose front is divided into cells, and on it a cushion, a back and
+    arms. Lengths are metres, each between two bounds.
+
+    Attributes:
+        foot, height: the lower and the upper side of the body above the floor.
+        legs: "legs", "table" (legs, sides or one column), "stand" (one column on a plate), or none.
+        cells: what cells hold, each as often as it stands here.
+        back, arms: height above the body, and thickness; None = without.
+        finish: of the body, each as often as it stands here.
+    """
+
+    width: Range
+    depth: Range
+    height: Range
+    foot: Range
+    legs: str
+    cell_width: Range
+    cell_height: Range
+    cells: tuple[str, ...]
+    cushion: Range
+    back: tuple[Range, Range] | None
+    arms: tuple[Range, Range] | None
+    finish: tuple[str, ...]
+
+
+@cache
+def makes() -> Mapping[str, Make]:
+    """The kinds of which `made_model` makes models."""
+    text = (files("gsencoder.data.furnished") / "makes.csv").read_text("utf-8")
+    found = {}
+    for row in csv.DictReader(io.StringIO(text)):
+        kind, lists = row.pop("kind"), {key: tuple(row.pop(key).split("|")) for key in ("cells", "finish")}
+        legs, pairs = row.pop("legs"), {key: row.pop(key) for key in ("back", "arms")}
+        ranges = {key: _range(cell) for key, cell in row.items()}
+        parts = {key: tuple(map(_range, cell.split())) or None for key, cell in pairs.items()}
+        found[kind] = Make(legs=legs, **lists, **ranges, **parts)  # type: ignore[arg-type]
+    return found
+
+
+def _range(cell: str) -> Range:
+    lower, upper = cell.split("-")
+    return float(lower), float(upper)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MadeModel(Model):
+    """A model that is made and not read from a library."""
+
+    made: Mesh
+
+    @property
+    def mesh(self) -> Mesh:
+        return self.made
+
+
+_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
+_CUBE = np.stack([np.insert(_SQUARE, axis, side, axis=1) for axis in range(3) for side in (0.0, 1.0)])
+"""The six quads of a block between 0 and 1."""
+_BODY, _FRONT, _HANDLE, _CLOTH, _CONTENTS = 0, 1, 2, 3, (4, 5, 6, 7)
+"""Materials of a model that is made."""
+
+
+class _Blocks:
+    """Blocks of which a thing is built, each with its material."""
+
+    def __init__(self, make: Make, rng: np.random.Generator) -> None:
+        self.rng, self.corners, self.materials = rng, [], []  # type: ignore[var-annotated]
+        handle = rng.choice(["paint", "wood", "metal"], p=[0.2, 0.2, 0.6])
+        self.finishes = (*rng.choice(make.finish, 2).tolist(), str(handle), *(5 * ["fabric"]))
+        # Fronts, handles and panes of one thing are alike.
+        self.front = _FRONT if rng.random() < 0.5 else _BODY
+        self.framed, self.overlay = rng.random() < 0.4, 0.02 * (rng.random() < 0.5)
+        self.handle = rng.uniform([0.02, 0.012, 0.015], [0.35, 0.03, 0.05])
+        self.bars = (1, 1) if rng.random() < 0.4 else (1 + int(rng.integers(3)), 1 + int(rng.integers(4)))
+        self.rail, self.inner = float(rng.uniform(0.04, 0.12)), float(rng.uniform(0.3, 1.0))
+
+    def add(self, x: Span, y: Span, z: Span, material: int) -> None:
+        self.corners.append(((x[0], y[0], z[0]), (x[1], y[1], z[1])))
+        self.materials.append(material)
+
+    def edges(self, span: Span, cell: Range) -> np.ndarray:
+        """Edges of cells in a span, which are equally large half of the time."""
+        sizes = np.ones(max(1, round((span[1] - span[0]) / self.rng.uniform(*cell))))
+        if self.rng.random() < 0.5:
+            sizes = self.rng.uniform(0.6, 1.4, len(sizes))
+        return span[0] + (span[1] - span[0]) * np.concatenate([[0.0], np.cumsum(sizes) / sizes.sum()])
+
+    def lattice(self, xs: np.ndarray, y: Span, zs: np.ndarray, bar: float, material: int, inner: float = 1.0) -> None:
+        """Bars around and between cells; `inner` is the width of those between them as a share of the others'."""
+        for edges, upright in ((xs, True), (zs, False)):
+            widths = np.full(len(edges), inner * bar)
+            widths[[0, -1]] = bar
+            for at, width in zip(np.clip(edges, edges[0] + bar / 2, edges[-1] - bar / 2), widths, strict=True):
+                across = float(at - width / 2), float(at + width / 2)
+                x, z = (across, (zs[0], zs[-1])) if upright else ((xs[0], xs[-1]), across)
+                self.add(x, y, z, material)
+
+    def fill(self, cell: str, x: Span, z: Span, depth: float) -> None:
+        """Fills a cell of the front, which is at y = −depth / 2."""
+        if cell in ("door", "drawer"):
+            self._closed(cell == "drawer", x, z, -depth / 2 - self.overlay)
+        elif cell in ("leaf", "pane"):
+            self._panes(cell == "leaf", x, z, 0.4 * depth)
+        elif cell in ("plain", "rib"):
+            self.add((x[0], x[1] if cell == "plain" else 0.4 * x[0] + 0.6 * x[1]), (-depth / 2, depth / 2), z, _BODY)
+        elif cell == "books":
+            at, end = x[0] + 0.02, x[0] + (x[1] - x[0]) * float(self.rng.uniform(0.3, 1.2))
+            while at < min(end, x[1] - 0.05):
+                thick, tall, deep = self.rng.uniform([0.015, 0.55, 0.6], [0.06, 0.92, 0.95])
+                top = z[0] + tall * (z[1] - z[0])
+                self.add((at, at + thick), (depth * (0.5 - deep), depth / 2), (z[0], top), self._content())
+                at += thick
+        elif self.rng.random() < 0.4:
+            size = self.rng.uniform(0.05, 0.8, 3) * (x[1] - x[0], depth, z[1] - z[0])
+            at = float(self.rng.uniform(x[0], x[1] - size[0]))
+            self.add((at, at + size[0]), (-size[1] / 2, size[1] / 2), (z[0], z[0] + size[2]), self._content())
+
+    def _content(self) -> int:
+        return int(self.rng.choice(_CONTENTS))
+
+    def _closed(self, is_drawer: bool, x: Span, z: Span, y: float) -> None:
+        """A door or a drawer with a handle, before the body or between its boards."""
+        gap = 0.004 if self.overlay else 0.012
+        (x0, x1), (z0, z1) = (x[0] + gap, x[1] - gap), (z[0] + gap, z[1] - gap)
+        self.add((x0, x1), (y + 0.008 * self.framed, y + 0.02), (z0, z1), self.front)
+        if self.framed and min(x1 - x0, z1 - z0) > 0.15:
+            self.lattice(np.array([x0, x1]), (y - 0.004, y + 0.02), np.array([z0, z1]), 0.06, self.front)
+        long, thick, reach = self.handle
+        size = (min(long, 0.6 * (x1 - x0)), thick) if is_drawer else (thick, min(long, 0.6 * (z1 - z0)))
+        # Handles of doors are on the side of the middle of the thing, as near to the height of hands as they can be.
+        side = x1 - 0.04 if x0 + x1 < 0 else x0 + 0.04
+        at = ((x0 + x1) / 2, (z0 + z1) / 2) if is_drawer else (side, np.clip(1.0, (3 * z0 + z1) / 4, (z0 + 3 * z1) / 4))
+        spans = [(float(c - s / 2), float(c + s / 2)) for c, s in zip(at, size, strict=True)]
+        self.add(spans[0], (y - reach, y), spans[1], _HANDLE)
+
+    def _panes(self, is_leaf: bool, x: Span, z: Span, thick: float) -> None:
+        """The leaf of a door with its panels and handles, or of glass, or the sash of a window."""
+        if is_leaf and self.rng.random() < 0.85:
+            self.add(x, (-thick / 2, thick / 2), z, self.front)
+            thick += float(self.rng.choice([0.004, 0.012, 0.02]))
+        xs, zs = np.linspace(*x, self.bars[0] + 1), np.linspace(*z, self.bars[1] + 1)
+        self.lattice(xs, (-thick / 2, thick / 2), zs, self.rail, self.front, self.inner)
+        if is_leaf:
+            at = x[1] - 0.08 if self.rng.random() < 0.5 else x[0] + 0.08
+            self.add((at - 0.06, at + 0.06), (-0.07, 0.07), (1.0, 1.0 + float(self.handle[1])), _HANDLE)
+
+    def legs(self, style: str, width: float, depth: float, foot: float) -> None:
+        """What carries a body."""
+        if style == "table":
+            style = str(self.rng.choice(["legs", "sides", "stand"], p=[0.7, 0.15, 0.15]))
+        thick = float(self.rng.uniform(0.025, 0.08))
+        (x, y), z = (width / 2, depth / 2), (0.0, foot)
+        if style == "stand":
+            self.add((-thick, thick), (-thick / 2, thick / 2), z, _BODY)
+            self.add((-x / 2, x / 2), (-0.6 * max(y, 0.15), 0.6 * max(y, 0.15)), (0.0, 0.02), _BODY)
+        for at in (-x, x - thick) if style != "stand" else ():
+            for front in (-y, y - thick) if style == "legs" else ():
+                self.add((at, at + thick), (front, front + thick), z, _BODY)
+            if style == "sides":
+                self.add((at, at + thick), (-y, y), z, _BODY)
+
+    def mesh(self) -> Mesh:
+        lower, upper = np.swapaxes(np.array(self.corners), 0, 1)[:, :, None, None]
+        quads = (lower + _CUBE * (upper - lower)).reshape(-1, 4, 3)
+        return mesh_of_quads(list(quads), np.repeat(self.materials, 6).tolist())
+
+
+def made_model(kind: str, rng: np.random.Generator) -> MadeModel:
+    """Makes a model of one of the kinds that `makes` has, unlike any other."""
+    make = makes()[kind]
+    blocks = _Blocks(make, rng)
+    width, depth, height, foot = (float(rng.uniform(*each)) for each in make[:4])
+    foot *= rng.random() < 0.6 or make.legs != "legs"
+    hung = kind == "kitchen cabinet" and rng.random() < 0.4
+    x, y, is_opening = (-width / 2, width / 2), (-depth / 2, depth / 2), make.cells[0] in ("leaf", "pane")
+    is_block = make.cells[0] in ("plain", "rib")
+    zs = blocks.edges((foot, height), make.cell_height)
+    bar = float(rng.uniform(0.03, 0.09) if is_opening else rng.uniform(0.015, 0.04))
+    for number, column in enumerate(pairwise(blocks.edges(x, make.cell_width))):
+        if number and not is_opening and rng.random() < 0.3:
+            zs = blocks.edges((foot, height), make.cell_height)
+        if not is_block:
+            blocks.lattice(np.array(column), y, zs, bar, _BODY)
+        for row in pairwise(zs):
+            blocks.fill(str(rng.choice(make.cells)), column, row, depth)
+    if not is_opening and not is_block and rng.random() < 0.9:
+        blocks.add(x, (depth / 2 - 0.01, depth / 2), (foot, height), _BODY)
+    if foot:
+        blocks.legs(make.legs, width, depth, foot)
+    cushion = float(rng.uniform(*make.cushion))
+    if cushion:
+        blocks.add((x[0] + 0.02, x[1] - 0.02), (y[0] + 0.01, y[1]), (height, height + cushion), _CLOTH)
+    if make.back:
+        rise, thick = (float(rng.uniform(*each)) for each in make.back)
+        blocks.add(x, (y[1] - thick, y[1]), (foot, height + rise), _BODY)
+    if make.arms and rng.random() < 0.8:
+        rise, thick = (float(rng.uniform(*each)) for each in make.arms)
+        for side in ((x[0], x[0] + thick), (x[1] - thick, x[1])):
+            blocks.add(side, y, (foot, height + rise), _BODY)
+    mesh = blocks.mesh()
+    return MadeModel(
+        id=f"made {kind}",
+        name=kind,
+        kind=kinds()[kind],
+        size=(width, depth, float(mesh.extent[1, 2])),
+        elevation=float(rng.uniform(1.3, 1.5)) if hung else 0.0,
+        top=height + cushion,
+        made=mesh,
+        finishes=blocks.finishes,
+    )

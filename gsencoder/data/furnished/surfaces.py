@@ -150,14 +150,15 @@ _PALETTES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float
     "wall": ((0.0, 1.0), (0.0, 0.3), (0.5, 0.98)),
     "ceiling": ((0.0, 0.2), (0.0, 0.08), (0.75, 1.0)),
     "metal": ((0.5, 0.7), (0.0, 0.1), (0.3, 0.9)),
+    "paint": ((0.0, 1.0), (0.0, 0.35), (0.3, 1.0)),
 }
 _EXCHANGES = ("wood", "fabric", "stone", "metal")
 
 
 def looks_of(item: Item, mesh: Mesh, rng: np.random.Generator) -> list[Look]:
     """The materials of an item: those of its model, tinted, recolored or exchanged, or one for its finish."""
-    if item.finish:
-        return [_finish(item.finish, rng)]
+    if finishes := (item.finish,) if item.model is None else item.model.finishes:
+        return [_finish(each, rng) for each in finishes]
     change = rng.random()
     exchanged = rng.random(len(mesh.colors)) < (0.5 if change < 0.25 else 0.05)
     return [
@@ -203,6 +204,8 @@ def _finish(finish: str, rng: np.random.Generator) -> Look:
         return _tiles(_color("stone" if rng.random() < 0.7 else "wall", rng), rng)
     if finish == "rug":
         return _blocks(rng, 0.7) if rng.random() < 0.6 else _noise(_color("fabric", rng), rng)
+    if finish == "paint":
+        return _noise(_color("ceiling" if rng.random() < 0.5 else "paint", rng), rng)
     if finish == "picture":
         return _blocks(rng, float(rng.uniform(0.3, 1.0)))
     if finish == "mirror":
