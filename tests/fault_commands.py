@@ -69,7 +69,6 @@ CASES: dict[str, Case] = {
     "evaluate instances": Case(f"evaluate {FUSED} protocol=instances"),
     "rooms": Case("rooms GIVEN/library.sh3f types=[bathroom] walk.views=3 walk.width=32", several=True),
     "score": Case("score recognition predictions=GIVEN/named/predictions.json truth=GIVEN/named/truth.json"),
-    "questions": Case("questions GIVEN/room min_pixels=10 per_kind=2 objects=2 per_object=1", other=("seed=1",)),
     "tune": Case(
         f"tune GIVEN/ScanQA_v1.0_train.json model=GIVEN/model features=GIVEN/tuned {VIEWS} image_side=64 lora.rank=4 "
         "train.steps=2 train.accumulate=1 train.warmup=1 train.log_every=1 train.checkpoint_every=0",

@@ -70,11 +70,6 @@ _LISTED = (
     ),
     Command("ask", "AskCommandConfig", "ask a vision-language model about views of a scene"),
     Command(
-        "questions",
-        "QuestionsConfig",
-        "make questions and expressions with their answers from the labels of scenes",
-    ),
-    Command(
         "tune",
         "TuneCommandConfig",
         "train adapters of a vision-language model on questions about scenes and their answers",

@@ -14,10 +14,10 @@ from fault_runs import CUT, DENY, FULL, IO_ERROR, KILL, READ_ERROR, SHORT, SHORT
 
 FAULTS = {
     "train": (KILL, TEAR), "reconstruct": (KILL, IO_ERROR), "pack as npz": (TEAR, FULL), "score": (KILL, SHORT),
-    "questions": (FULL, SHORT_FULL), "repair": (KILL, FULL),
+    "repair": (KILL, FULL),
 }  # fmt: skip
 """Of each way in which commands write: folders of state that a run continues from, logs, folders, single files."""
-LOST_INPUTS = {"pack as npz": (DENY, VANISH), "score": (CUT, READ_ERROR), "questions": (VANISH, CUT)}
+LOST_INPUTS = {"pack as npz": (DENY, VANISH), "score": (CUT, READ_ERROR)}
 Checkers = Callable[[str], Checker]
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import write_json
 from gsencoder.data.labels.expressions import PREDICTED
 from gsencoder.data.labels.files import (
     Corner,
@@ -76,23 +75,6 @@ def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question
         f"{file}: expected ScanQA's list of questions or SQA3D's object with questions, got {brief(content)}"
         + (hint if isinstance(content, dict) and "annotations" in content else "")
     )
-
-
-def write_scanqa(path: str | Path, questions: Sequence[Question]) -> None:
-    """Writes questions as ScanQA's files have them."""
-    _refuse_repeated(Path(path), [each.id for each in questions])
-    rows = [
-        {
-            "scene_id": each.scene,
-            "question_id": each.id,
-            "question": each.text,
-            "answers": list(each.answers),
-            "object_ids": list(each.object_ids),
-            "object_names": list(each.object_names),
-        }
-        for each in questions
-    ]
-    write_json(path, [{k: v for k, v in row.items() if k != "answers" or v} for row in rows])
 
 
 def _scanqa(rows: Any, path: Path, answered: bool) -> tuple[Question, ...]:
@@ -187,49 +169,3 @@ def _annotated(question: Question, entry: Mapping[str, Any], where: str) -> Ques
 
 def _refuse_repeated(path: Path, ids: Sequence[str]) -> None:
     refuse_repeated(path, ids, lambda each: each[:60], what="question_id")
-
-
-def write_sqa3d(path: str | Path, questions: Sequence[Question]) -> Path:
-    """Writes situated questions as SQA3D's two files have them.
-
-    Args:
-        path: of the file of questions, whose name must have "questions" in it.
-
-    Returns:
-        The file of annotations next to it, where `read_questions` looks for it.
-    """
-    file = Path(path)
-    annotations = file.with_name(file.name.replace("questions", SITUATED))
-    if annotations == file:
-        raise InputError(f"{file}: expected a name with questions in it")
-    rows, answers = [], []
-    for each in questions:
-        if each.situation is None or each.position is None or each.rotation is None:
-            raise InputError(f"{file}: question {each.id[:60]} has no situation")
-        w, x, y, z = each.rotation
-        rows.append(
-            {
-                "scene_id": each.scene,
-                "situation": each.situation,
-                "alternative_situation": [],
-                "question": each.text,
-                "question_id": each.id,
-            }
-        )
-        answers.append(
-            {
-                "scene_id": each.scene,
-                "question_type": "N/A",
-                "answer_type": "other",
-                "question_id": each.id,
-                "answers": [
-                    {"answer": answer, "answer_confidence": "yes", "answer_id": number}
-                    for number, answer in enumerate(each.answers, start=1)
-                ],
-                "rotation": {"_x": x, "_y": y, "_z": z, "_w": w},
-                "position": dict(zip("xyz", each.position, strict=True)),
-            }
-        )
-    write_json(file, {"task_type": "Situated question answering", "questions": rows})
-    write_json(annotations, {"annotations": answers})
-    return annotations

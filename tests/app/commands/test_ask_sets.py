@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import questions
 from chat_server import Handler, answer, serving
 from command_runs import refusal, results_of
 from named_rooms import write_words
@@ -37,8 +38,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_room(room, folder / "rooms" / room.name)
         fused = (f"teacher.words={words}", "seeds.voxel=0.04", f"out={folder / 'features' / room.name}", "quiet=true")
         assert cli.main(["fuse", str(folder / "rooms" / room.name), "teacher=labels", *fused]) == 0
-    made = ("min_pixels=60", "per_kind=2", "objects=2", "per_object=1", f"out={folder / 'set'}", "quiet=true")
-    assert cli.main(["questions", str(folder / "rooms"), *made]) == 0
+    few = ("--min-pixels=60", "--per-kind=2", "--objects=2", "--per-object=1")
+    questions.main([str(folder / "set"), str(folder / "rooms"), *few])
     return folder
 
 

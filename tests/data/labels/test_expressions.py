@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from labeled_scans import group, write_scannet_labels
+from questions import write_scanqa
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.expressions import (
@@ -21,7 +22,7 @@ from gsencoder.data.labels.expressions import (
     read_scanrefer,
     write_scanrefer,
 )
-from gsencoder.data.labels.questions import Question, read_questions, write_scanqa
+from gsencoder.data.labels.questions import Question, read_questions
 from gsencoder.data.labels.scans import read_scannet_labels
 
 NR3D = {

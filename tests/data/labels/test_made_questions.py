@@ -6,16 +6,12 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import made_questions
 import numpy as np
 import pytest
-from splats import front_camera, random_gaussians
-
-from gsencoder.core.errors import InputError
-from gsencoder.data.labels import made_questions
-from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
-from gsencoder.data.labels.made_questions import kind_of, make_expressions, make_questions, make_situations, side_of
-from gsencoder.data.labels.questions import Question, read_questions, write_scanqa, write_sqa3d
-from gsencoder.data.labels.seen_objects import (
+from made_questions import kind_of, make_expressions, make_questions, make_situations, side_of
+from questions import write_scanqa, write_sqa3d
+from seen_objects import (
     COLOR_VIEWS,
     RANGES,
     SeenObject,
@@ -24,6 +20,11 @@ from gsencoder.data.labels.seen_objects import (
     color_word,
     see_objects,
 )
+from splats import front_camera, random_gaussians
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
+from gsencoder.data.labels.questions import Question, read_questions
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, SceneObject, Views
 

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-
-from gsencoder.data.labels.made_questions import alike, is_plural, plural, with_article
-from gsencoder.data.labels.seen_objects import (
+from made_questions import alike, is_plural, plural, with_article
+from seen_objects import (
     SeenObject,
     adjacent,
     clearly_nearer,

@@ -40,11 +40,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
-
-from gsencoder.core.errors import InputError
-from gsencoder.data.labels.expressions import Expression
-from gsencoder.data.labels.questions import Question
-from gsencoder.data.labels.seen_objects import (
+from seen_objects import (
     NEAR,
     SeenObject,
     SeenScene,
@@ -58,6 +54,10 @@ from gsencoder.data.labels.seen_objects import (
     neighbor,
     supporter,
 )
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.questions import Question
 
 NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 PLURAL_ONLY = ("scissors", "dice", "pants", "glasses", "products", "utensils")
