@@ -222,6 +222,8 @@ class MadeModel(Model):
 _SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
 _CUBE = np.stack([np.insert(_SQUARE, axis, side, axis=1) for axis in range(3) for side in (0.0, 1.0)])
 """The six quads of a block between 0 and 1."""
+_BOARD = 0.015
+"""Least thickness of the top of a table, metres."""
 _BODY, _FRONT, _HANDLE, _CLOTH, _CONTENTS = 0, 1, 2, 3, (4, 5, 6, 7)
 """Materials of a model that is made."""
 
@@ -336,7 +338,7 @@ def made_model(kind: str, rng: np.random.Generator) -> MadeModel:
     make = makes()[kind]
     blocks = _Blocks(make, rng)
     width, depth, height, foot = (float(rng.uniform(*each)) for each in make[:4])
-    foot *= rng.random() < 0.6 or make.legs != "legs"
+    foot = min(foot, height - _BOARD) * (rng.random() < 0.6 or make.legs != "legs")
     hung = kind == "kitchen cabinet" and rng.random() < 0.4
     x, y, is_opening = (-width / 2, width / 2), (-depth / 2, depth / 2), make.cells[0] in ("leaf", "pane")
     is_block = make.cells[0] in ("plain", "rib")
@@ -364,13 +366,15 @@ def made_model(kind: str, rng: np.random.Generator) -> MadeModel:
         for side in ((x[0], x[0] + thick), (x[1] - thick, x[1])):
             blocks.add(side, y, (foot, height + rise), _BODY)
     mesh = blocks.mesh()
+    lower, upper = mesh.extent
+    middle = np.array([*(lower + upper)[:2] / 2, lower[2]])
     return MadeModel(
         id=f"made {kind}",
         name=kind,
         kind=kinds()[kind],
-        size=(width, depth, float(mesh.extent[1, 2])),
+        size=tuple((upper - lower).tolist()),
         elevation=float(rng.uniform(1.3, 1.5)) if hung else 0.0,
         top=height + cushion,
-        made=mesh,
+        made=mesh._replace(vertices=(mesh.vertices - middle).astype(np.float32)),
         finishes=blocks.finishes,
     )

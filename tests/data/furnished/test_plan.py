@@ -12,7 +12,7 @@ from gsencoder.data.furnished import plan
 from gsencoder.data.furnished.kinds import ROOM_TYPES, STRUCTURE, kinds
 from gsencoder.data.furnished.library import Model, load_libraries
 from gsencoder.data.furnished.plan import THICKNESS, Box, Home, Item, Room, plan_home
-from gsencoder.data.furnished.shapes import Rectangle, panels
+from gsencoder.data.furnished.shapes import MadeModel, Rectangle, made_model, makes, panels
 
 SEEDS = range(12)
 
@@ -27,9 +27,11 @@ def things(home: Home | Room) -> list[Item]:
     return [item for item in home.items if item.model is not None and kinds()[item.kind].place != "opening"]
 
 
+@pytest.mark.parametrize("made", [0.0, 1.0])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_no_two_things_overlap(seed: int, models: tuple[Model, ...]) -> None:
-    placed = [(item.kind, box_of_item(item)) for item in things(plan_home(models, np.random.default_rng(seed)))]
+def test_no_two_things_overlap(seed: int, made: float, models: tuple[Model, ...]) -> None:
+    home = plan_home(models, np.random.default_rng(seed), made=made)
+    placed = [(item.kind, box_of_item(item)) for item in things(home)]
     for (one, a), (other, b) in combinations(placed, 2):
         depth = np.minimum(a[1], b[1]) - np.maximum(a[0], b[0])
         # A small thing lies on the box of what carries it, or within it above a seat.
@@ -157,3 +159,39 @@ def test_a_library_of_one_chair_furnishes_a_home(tmp_path: Path) -> None:
     for seed in SEEDS:
         home = plan_home(models, np.random.default_rng(seed))
         assert {"wall", "floor", "ceiling"} <= {item.kind for item in home.items}
+
+
+@pytest.mark.parametrize("kind", makes())
+def test_a_make_of_our_own_is_as_large_as_it_says_and_unlike_the_next(kind: str) -> None:
+    sizes = set()
+    for seed in range(20):
+        model = made_model(kind, np.random.default_rng(seed))
+        mesh, size = model.mesh, np.array(model.size)
+        np.testing.assert_allclose(
+            mesh.extent, [[-size[0] / 2, -size[1] / 2, 0], [size[0] / 2, size[1] / 2, size[2]]], atol=1e-6
+        )
+        assert model.top is not None
+        assert 0 < model.top <= size[2] + 1e-6
+        assert mesh.materials.max() < len(model.finishes)
+        corners = mesh.vertices[mesh.faces].astype(np.float64)
+        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        assert areas.min() > 0
+        sizes.add(model.size)
+    assert len(sizes) == 20
+    again = made_model(kind, np.random.default_rng(19))
+    np.testing.assert_array_equal(again.mesh.vertices, mesh.vertices)
+
+
+def test_makes_of_our_own_come_at_the_share_asked_for_and_of_kinds_that_the_libraries_have(
+    models: tuple[Model, ...],
+) -> None:
+    without = tuple(model for model in models if model.kind.name != "wardrobe")
+    counts = {}
+    for made in (0.0, 0.5, 1.0):
+        homes = [plan_home(without, np.random.default_rng(seed), ["bedroom"], made=made) for seed in range(40)]
+        placed = [item for home in homes for item in home.items if item.model is not None and item.kind in makes()]
+        assert all(item.kind != "wardrobe" for item in placed)
+        counts[made] = np.mean([isinstance(item.model, MadeModel) for item in placed])
+    assert counts[0.0] == 0
+    assert counts[1.0] == 1
+    assert counts[0.5] == pytest.approx(0.5, abs=0.15)
