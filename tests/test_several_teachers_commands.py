@@ -71,6 +71,8 @@ def test_a_training_starts_from_weights_of_another_and_refuses_those_of_another_
     assert "init: house was made with model." in refusal(
         capsys, "train", *words, "init=house", f"out={tmp_path / 'other'}"
     )
+    # Before anything is prepared.
+    assert not (tmp_path / "other.prepared").exists()
 
 
 def test_training_leaves_one_encoder_with_the_spaces_words_and_scores_of_both_teachers(rooms, trained):

@@ -231,14 +231,7 @@ def start_from(encoder: GaussianEncoder, outputs: OutputSpaces, source: str | Pa
     """Gives an encoder the parameters of trained weights. Its last layers are converted to its own output spaces, whose
     means, scales and bases may be others, so that it predicts the same features; a teacher that the weights do not
     predict keeps its projector, with a warning."""
-    trained, spaces, _ = load_weights(source, "init")
-    theirs, ours = (
-        asdict(replace(each.config, transformer=replace(each.config.transformer, drop_path=0.0)))
-        for each in (trained, encoder)
-    )
-    if theirs != ours:
-        difference = first_difference({"model": theirs}, {"model": ours})
-        raise InputError(f"init: {source} was made with {difference}; give the settings that it was made with")
+    trained, spaces = load_start(encoder.config, source)
     state = {name: value for name, value in trained.state_dict().items() if not name.startswith("head.")}
     encoder.load_state_dict(state, strict=False)
     for teacher, target in outputs.by_teacher.items():
@@ -254,6 +247,18 @@ def start_from(encoder: GaussianEncoder, outputs: OutputSpaces, source: str | Pa
         values = (*hidden, (converted[2:] - converted[0]).T, converted[1])
         for parameter, value in zip(encoder.head_parameters(outputs, teacher), values, strict=True):
             parameter.copy_(value)
+
+
+def load_start(config: EncoderConfig, source: str | Path) -> tuple[GaussianEncoder, OutputSpaces]:
+    """Reads weights to start from, and checks that they are of a network with these settings."""
+    trained, spaces, _ = load_weights(source, "init")
+    theirs, ours = (
+        asdict(replace(each, transformer=replace(each.transformer, drop_path=0.0))) for each in (trained.config, config)
+    )
+    if theirs != ours:
+        difference = first_difference({"model": theirs}, {"model": ours})
+        raise InputError(f"init: {source} was made with {difference}; give the settings that it was made with")
+    return trained, spaces
 
 
 def _read_config(values: dict[str, Any]) -> EncoderConfig:

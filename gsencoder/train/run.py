@@ -17,7 +17,7 @@ from gsencoder.core.process import Device, ProcessRank, Track, untracked
 from gsencoder.core.settings import option
 from gsencoder.core.threads import threads_of_torch
 from gsencoder.fusion.measured_heads import heads_digest
-from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, start_from
+from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, load_start, start_from
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words, closed_table
@@ -172,11 +172,24 @@ def train(
         folder.mkdir(parents=True, exist_ok=True)
         with fail_together():
             if process.is_first:
-                check_same_teachers(folder / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
+                check_start(config, folder / TRAINING_CHECKPOINT_FILE)
         place: dict[str, Any] = {"process": process, "device": chosen_device, "track": track}
         prepared_in = Path(prepared) if prepared is not None else folder / "prepared"
         datasets = prepare(training, validation, words, config, prepared_in, **place)
         return fit(datasets, training, validation, words, config, work=folder, validate=validate, **place)
+
+
+def check_start(config: TrainConfig, checkpoint: Path | None) -> None:
+    """Checks, before hours of preparation, what a run continues, which is a checkpoint if there is one, or starts from;
+    and that the libraries of rooms can be read."""
+    if checkpoint is not None and checkpoint.is_file():
+        check_same_teachers(checkpoint, list(config.teachers_by_name))
+    elif config.init:
+        load_start(config.model, config.init)
+    if config.rooms.libraries:
+        from gsencoder.train.rooms import models_of
+
+        models_of(config.rooms)
 
 
 def prepare(
@@ -192,10 +205,6 @@ def prepare(
 ) -> dict[str, PreparedDataset]:
     """Prepares the scenes of a training in a folder, with this process's share of the cores."""
     heads = required_heads(config.heads, config.teachers_by_name)
-    if config.rooms.libraries:
-        from gsencoder.train.rooms import models_of
-
-        models_of(config.rooms)  # What cannot be read is an error before hours of preparation.
     place: dict[str, Any] = {"process": process, "device": device, "track": track}
     with threads_of_torch(cpu_share(process, config.prepare_threads)):
         return prepare_scenes(scenes, held_out, words, config, folder, heads=heads, **place)

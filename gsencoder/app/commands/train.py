@@ -21,11 +21,11 @@ from gsencoder.models.encoder import save_weights
 from gsencoder.models.output_space import HEADS_FILE, WEIGHTS_FILE, OutputSpace
 from gsencoder.text.table import save_tables
 from gsencoder.train.distributed import fail_together, join_processes
-from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, check_same_teachers
+from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.prepare import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.prepare_scenes import split_scenes
 from gsencoder.train.prepared import PreparedScene
-from gsencoder.train.run import SceneValidator, TrainConfig, Training, fit, prepare
+from gsencoder.train.run import SceneValidator, TrainConfig, Training, check_start, fit, prepare
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,8 +70,8 @@ def run(config: TrainCommandConfig, run: Run) -> None:
         with fail_together():
             if not config.prepare_only:
                 folder = group.folder()
-                if folder is not None and config.resume:
-                    check_same_teachers(group.work.path / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
+                if folder is not None:
+                    check_start(config, group.work.path / TRAINING_CHECKPOINT_FILE if config.resume else None)
         with run.step("prepare"):
             datasets = prepare(
                 training, held_out, words, config, prepared, process=process, device=device, track=run.track
