@@ -30,13 +30,15 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=output_folder)
     parser.add_argument("scenes", nargs="+", help="scenes with photographs, instance maps and objects.json")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--per-kind", type=positive, default=10, help="most questions of a kind about a scene")
+    parser.add_argument("--per-kind", type=positive, default=10, help="most questions of a kind about a scene, from 2")
     parser.add_argument(
         "--min-pixels", type=positive, default=200, help="that a photograph shows of what is asked about"
     )
     parser.add_argument("--per-object", type=positive, default=3, help="most expressions that mean one object")
     parser.add_argument("--objects", type=int, default=0, help="most objects of a scene with expressions; 0 = all")
     arguments = parser.parse_args(words)
+    if min(arguments.seed, arguments.objects, arguments.per_kind - 2) < 0:
+        parser.error("expected --seed and --objects of 0 or more, and --per-kind of 2 or more")
     paths = find_scenes(arguments.scenes)
     check_names(paths)
     scenes = [see_objects(load_scene(path), arguments.min_pixels) for path in paths]

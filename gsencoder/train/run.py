@@ -180,16 +180,11 @@ def train(
 
 
 def check_start(config: TrainConfig, checkpoint: Path | None) -> None:
-    """Checks, before hours of preparation, what a run continues, which is a checkpoint if there is one, or starts from;
-    and that the libraries of rooms can be read."""
+    """Checks what a run continues, which is a checkpoint if there is one, or starts from; before hours of preparation."""
     if checkpoint is not None and checkpoint.is_file():
         check_same_teachers(checkpoint, list(config.teachers_by_name))
     elif config.init:
         load_start(config.model, config.init)
-    if config.rooms.libraries:
-        from gsencoder.train.rooms import models_of
-
-        models_of(config.rooms)
 
 
 def prepare(
@@ -205,6 +200,10 @@ def prepare(
 ) -> dict[str, PreparedDataset]:
     """Prepares the scenes of a training in a folder, with this process's share of the cores."""
     heads = required_heads(config.heads, config.teachers_by_name)
+    if config.rooms.libraries:
+        from gsencoder.train.rooms import models_of
+
+        models_of(config.rooms)  # What cannot be read is an error before hours of preparation.
     place: dict[str, Any] = {"process": process, "device": device, "track": track}
     with threads_of_torch(cpu_share(process, config.prepare_threads)):
         return prepare_scenes(scenes, held_out, words, config, folder, heads=heads, **place)

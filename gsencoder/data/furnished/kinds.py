@@ -47,26 +47,31 @@ def kinds() -> Mapping[str, Kind]:
 
 @cache
 def _table() -> tuple[tuple[Kind, tuple[str, ...]], ...]:
-    text = (files("gsencoder.data.furnished") / "kinds.csv").read_text("utf-8")
     return tuple(
         (
             Kind(
                 name=row["kind"],
-                synonyms=_listed(row["synonyms"]),
-                hypernyms=_listed(row["hypernyms"]),
+                synonyms=listed_cell(row["synonyms"]),
+                hypernyms=listed_cell(row["hypernyms"]),
                 place=cast(Place, row["place"]),
                 rooms={
                     cast(RoomType, room): float(weight)
-                    for room, weight in (each.split(":") for each in _listed(row["rooms"]))
+                    for room, weight in (each.split(":") for each in listed_cell(row["rooms"]))
                 },
             ),
-            _listed(row["names"]),
+            listed_cell(row["names"]),
         )
-        for row in csv.DictReader(io.StringIO(text))
+        for row in table_rows("kinds.csv")
     )
 
 
-def _listed(cell: str) -> tuple[str, ...]:
+def table_rows(name: str) -> list[dict[str, str]]:
+    """The rows of a table of this folder."""
+    return list(csv.DictReader(io.StringIO((files("gsencoder.data.furnished") / name).read_text("utf-8"))))
+
+
+def listed_cell(cell: str) -> tuple[str, ...]:
+    """The words of a cell, which | separates."""
     return tuple(each.strip() for each in cell.split("|") if each.strip())
 
 

@@ -1,19 +1,16 @@
 """Shapes that no library has: walls with openings, floors, slabs and curtains, and makes of our own of furniture, doors
 and windows, with texture coordinates in metres."""
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.data.furnished.kinds import kinds
+from gsencoder.data.furnished.kinds import kinds, listed_cell, table_rows
 from gsencoder.data.furnished.library import Mesh, Model
 
 
@@ -159,11 +156,11 @@ def _reveal(
 
 # Makes of our own --------------------------------------------------------------------------------------------------
 
-Range = tuple[float, float]
 Span = tuple[float, float]
+"""Lower and upper bound."""
 
 
-class Make(NamedTuple):
+class MakeRanges(NamedTuple):
     """How things of a kind vary: a body above feet, whose front is divided into cells, and on it a cushion, a back and
     arms. Lengths are metres, each between two bounds.
 
@@ -175,35 +172,34 @@ class Make(NamedTuple):
         finish: of the body, each as often as it stands here.
     """
 
-    width: Range
-    depth: Range
-    height: Range
-    foot: Range
+    width: Span
+    depth: Span
+    height: Span
+    foot: Span
     legs: str
-    cell_width: Range
-    cell_height: Range
+    cell_width: Span
+    cell_height: Span
     cells: tuple[str, ...]
-    cushion: Range
-    back: tuple[Range, Range] | None
-    arms: tuple[Range, Range] | None
+    cushion: Span
+    back: tuple[Span, Span] | None
+    arms: tuple[Span, Span] | None
     finish: tuple[str, ...]
 
 
 @cache
-def makes() -> Mapping[str, Make]:
+def makes() -> Mapping[str, MakeRanges]:
     """The kinds of which `made_model` makes models."""
-    text = (files("gsencoder.data.furnished") / "makes.csv").read_text("utf-8")
-    found = {}
-    for row in csv.DictReader(io.StringIO(text)):
-        kind, lists = row.pop("kind"), {key: tuple(row.pop(key).split("|")) for key in ("cells", "finish")}
+    by_kind = {}
+    for row in table_rows("makes.csv"):
+        kind, lists = row.pop("kind"), {key: listed_cell(row.pop(key)) for key in ("cells", "finish")}
         legs, pairs = row.pop("legs"), {key: row.pop(key) for key in ("back", "arms")}
         ranges = {key: _range(cell) for key, cell in row.items()}
         parts = {key: tuple(map(_range, cell.split())) or None for key, cell in pairs.items()}
-        found[kind] = Make(legs=legs, **lists, **ranges, **parts)  # type: ignore[arg-type]
-    return found
+        by_kind[kind] = MakeRanges(legs=legs, **lists, **ranges, **parts)  # type: ignore[arg-type]
+    return by_kind
 
 
-def _range(cell: str) -> Range:
+def _range(cell: str) -> Span:
     lower, upper = cell.split("-")
     return float(lower), float(upper)
 
@@ -231,7 +227,7 @@ _BODY, _FRONT, _HANDLE, _CLOTH, _CONTENTS = 0, 1, 2, 3, (4, 5, 6, 7)
 class _Blocks:
     """Blocks of which a thing is built, each with its material."""
 
-    def __init__(self, make: Make, rng: np.random.Generator) -> None:
+    def __init__(self, make: MakeRanges, rng: np.random.Generator) -> None:
         self.rng, self.corners, self.materials = rng, [], []  # type: ignore[var-annotated]
         handle = rng.choice(["paint", "wood", "metal"], p=[0.2, 0.2, 0.6])
         self.finishes = (*rng.choice(make.finish, 2).tolist(), str(handle), *(5 * ["fabric"]))
@@ -246,7 +242,7 @@ class _Blocks:
         self.corners.append(((x[0], y[0], z[0]), (x[1], y[1], z[1])))
         self.materials.append(material)
 
-    def edges(self, span: Span, cell: Range) -> np.ndarray:
+    def edges(self, span: Span, cell: Span) -> np.ndarray:
         """Edges of cells in a span, which are equally large half of the time."""
         sizes = np.ones(max(1, round((span[1] - span[0]) / self.rng.uniform(*cell))))
         if self.rng.random() < 0.5:
