@@ -180,7 +180,7 @@ def train(
 
 
 def check_start(config: TrainConfig, checkpoint: Path | None) -> None:
-    """Checks what a run continues, which is a checkpoint if there is one, or starts from; before hours of preparation."""
+    """Checks, before anything is prepared, the checkpoint that a run continues, or the weights that it starts from."""
     if checkpoint is not None and checkpoint.is_file():
         check_same_teachers(checkpoint, list(config.teachers_by_name))
     elif config.init:
