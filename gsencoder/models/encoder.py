@@ -85,9 +85,9 @@ class GaussianEncoder(nn.Module):
 
     def forward(
         self, attributes: Float[Tensor, "N A"], opacities: Float[Tensor, " N"], plan: Plan
-    ) -> Float[Tensor, "N channels"]:
-        """Predicts features in standard units (see `OutputSpace`), in float32 or wider even under autocast. `opacities`
-        are weights of the Gaussians within their tokens."""
+    ) -> Float[Tensor, "M channels"]:
+        """Predicts features in standard units (see `OutputSpace`), in float32 or wider even under autocast, for the
+        Gaussians that `plan.token_of` lists. `opacities` are weights of the Gaussians within their tokens."""
         tokens = merge(attributes, opacities.clamp(min=MIN_MERGE_WEIGHT), plan)
         if not torch.compiler.is_exporting():
             # Levels may end in unused tokens.
@@ -175,6 +175,7 @@ def encoder_inputs(
         opacities,
         tensor(gaussians.sh[:, 0]),
         voxel=voxel,
+        metres=config.voxel,
         attributes=config.inputs,
     )
     network = config.transformer

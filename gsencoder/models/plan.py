@@ -78,13 +78,14 @@ class Plan(NamedTuple):
     """The plan of a batch of clouds, N Gaussians and T tokens in all.
 
     Attributes:
+        token_of: the token of each Gaussian whose features are asked for: all N in their order, or M of them.
         members: the Gaussians sorted by token.
         counts: number of Gaussians of each token.
         levels: finest first.
         stem_neighbors: the cells around each token for a stem of 5³ cells, as `neighbors` of a level; None for 3³.
     """
 
-    token_of: Int64[Tensor, " N"]
+    token_of: Int64[Tensor, " M"]
     members: Int64[Tensor, " N"]
     counts: Int64[Tensor, " T"]
     levels: tuple[Level, ...]
@@ -105,7 +106,7 @@ class CloudLevel(NamedTuple):
 class CloudPlan(NamedTuple):
     """The plan of one cloud, before clouds are joined; attributes as in `Plan`."""
 
-    token_of: Int64[Tensor, " N"]
+    token_of: Int64[Tensor, " M"]
     members: Int64[Tensor, " N"]
     counts: Int64[Tensor, " T"]
     levels: tuple[CloudLevel, ...]

@@ -68,7 +68,9 @@ class RawEncoder(nn.Module):
                 level in turn, padded with `INVALID_CODE`; negative if the cloud is the full scene.
         """
         config = self.encoder.config
-        attributes = embed(means, quats, scales, opacities, sh_dc, voxel=voxel, attributes=config.inputs)
+        attributes = embed(
+            means, quats, scales, opacities, sh_dc, voxel=voxel, metres=config.voxel, attributes=config.inputs
+        )
         plan = _plan_cloud(means, voxel, corner, starts, config.transformer, config.stem)
         standard: Tensor = self.encoder(attributes, opacities, plan)
         return standard * self.get_buffer("unit") + self.get_buffer("offset")

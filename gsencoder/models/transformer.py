@@ -448,7 +448,7 @@ def _make_blocks(config: TransformerConfig, channels: int, rates: list[float]) -
     return nn.ModuleList(Block(channels, heads, drop_path=rate) for rate in rates)
 
 
-Attribute = Literal["offset", "color", "opacity", "scale", "rotation", "height"]
+Attribute = Literal["offset", "color", "opacity", "scale", "rotation", "height", "cell"]
 
 ATTRIBUTE_CHANNELS: dict[Attribute, int] = {
     "offset": 3,
@@ -457,6 +457,7 @@ ATTRIBUTE_CHANNELS: dict[Attribute, int] = {
     "scale": 3,
     "rotation": 6,
     "height": 2,
+    "cell": 1,
 }
 
 MAX_ABS_LOG_SCALE = 12.0
@@ -477,6 +478,7 @@ def embed(
     sh_dc: Float[Tensor, "N 3"],
     *,
     voxel: float | Float[Tensor, ""],
+    metres: float,
     attributes: tuple[Attribute, ...],
 ) -> Float[Tensor, "N C"]:
     """The input channels, all of order one, concatenated in the order of `attributes`.
@@ -485,8 +487,8 @@ def embed(
     ±2. opacity: −1 to 1. scale: ¼ of log(scale / voxel), largest first. rotation: ¼ of the six distinct entries of
     R diag(log s − mean log s) Rᵀ, the off-diagonal ones times √2, so that distances between inputs are Frobenius
     distances between matrices. height: z above the floor in 50 voxels and in 5, less 1, clamped to ±2 and ±1; z must be
-    up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). The voxel, in world units, is a tensor in an
-    exported graph, where it is an input.
+    up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). cell: log₂ of the voxel in metres over 5 cm. The
+    voxel, in world units, is a tensor in an exported graph, where it is an input; `metres` is the same edge in metres.
     """
     channels: list[Tensor] = []
     log_scales = torch.log(scales.double() / voxel).clamp(-MAX_ABS_LOG_SCALE, MAX_ABS_LOG_SCALE).to(means.dtype)
@@ -502,6 +504,8 @@ def embed(
             cells = means[:, 2:].double() / voxel
             channels.append((cells / 50 - 1).clamp(-2, 2).to(means.dtype))
             channels.append((cells / 5 - 1).clamp(-1, 1).to(means.dtype))
+        elif name == "cell":
+            channels.append(torch.full_like(means[:, :1], math.log2(metres / 0.05)))
         elif name == "scale":
             channels.append(log_scales.sort(dim=1, descending=True).values / 4)
         else:

@@ -190,6 +190,10 @@ class ScenePart(ABC):
 
     path: Path
     name: str
+    voxel: float | None = None
+    """Edge of the token grid that the Gaussians are meant for, metres; None = any."""
+    labeled: bool = False
+    """Whether the target of each Gaussian is the vector of its class."""
 
     @abstractmethod
     def __len__(self) -> int: ...

@@ -16,10 +16,10 @@ from gsencoder.data.furnished.library import Model, load_libraries, select_makes
 from gsencoder.data.furnished.plan import plan_home
 from gsencoder.data.furnished.walk import LabeledSplat, furnished_splat, splat_walk
 from gsencoder.train.prepared import ScenePart, ViewRows
-from gsencoder.train.samples import Codes, RoomsConfig, TrainingScene
+from gsencoder.train.samples import Codes, RoomsConfig, SamplingConfig, TrainingScene
 from gsencoder.types import Cameras, Gaussians
 
-SLOTS = 512
+SLOTS = 160
 """Smallest number of rooms from which samples are drawn in turn. A network that meets the same few dozen rooms for a
 hundred steps learns these by heart, and nothing of things elsewhere."""
 STORED = 0.5
@@ -31,8 +31,8 @@ MADE = 0.5
 """Share of makes of our own, of kinds of which there are such: from ten doors of a library no others are learned."""
 LEAST_VIEWS = 0.4
 """Smallest share of the views of a walk that sees most things: people scan a part of a room, or in haste."""
-DENSITIES = (0.45, 1.4)
-"""Smallest and largest distance of the seeds, in voxels of the encoder."""
+DENSITIES, FINEST = (0.4, 1.1), 0.015
+"""Smallest and largest distance of the seeds, in voxels of the encoder, and the smallest one in metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,8 +43,10 @@ class LabeledPart(ScenePart):
     splat: LabeledSplat
     codes_of_rows: Int32[np.ndarray, " N"]
     codebook: Float32[np.ndarray, "C channels"]
+    voxel: float | None
     path: Path = Path()
     metres_per_unit: float | None = 1.0
+    labeled: bool = True
 
     def __len__(self) -> int:
         return len(self.splat.means)
@@ -110,6 +112,7 @@ class RoomStream:
         config: RoomsConfig,
         codebook: Float32[np.ndarray, "C channels"],
         code_of: Mapping[str, int],
+        sampling: SamplingConfig = SamplingConfig(),
         *,
         voxel: float,
         teachers: int = 1,
@@ -121,13 +124,14 @@ class RoomStream:
 
         Args:
             codebook, code_of: vectors of the labels in standard units, and the row of each kind.
-            voxel: of the encoder, metres.
+            sampling, voxel: the largest cells in units of the encoder's, and the edge of these, metres.
             teachers, teacher: the number of teachers of the training, and which of them has the labels.
             step_samples: samples of a step over all processes.
         """
         self.config, self.share = config, config.share
         self._models = models_of(config)
-        self._codebook, self._code_of, self._voxel, self._seed = codebook, code_of, voxel, seed
+        self._codebook, self._code_of, self._seed = codebook, code_of, seed
+        self._sampling, self._voxel = sampling, voxel
         self._teachers, self._teacher = teachers, teacher
         # An even number of steps, so that two data workers have slots of their own.
         self.slots = step_samples * 2 * -(-SLOTS // (2 * step_samples))
@@ -154,7 +158,10 @@ class RoomStream:
         noise = NOISE[0] * (NOISE[1] / NOISE[0]) ** rng.random()
         walk = splat_walk(home, noise=noise, drift=float(rng.uniform(0, DRIFT)))
         walk = replace(walk, views=max(1, round(walk.views * rng.uniform(LEAST_VIEWS, 1))))
-        spacing = DENSITIES[0] * (DENSITIES[1] / DENSITIES[0]) ** rng.random() * self._voxel
-        splat = furnished_splat(home, walk, spacing, rng)
+        voxel = self._sampling.draw_voxel(self._voxel, rng)
+        spacing = DENSITIES[0] * (DENSITIES[1] / DENSITIES[0]) ** rng.random() * voxel
+        splat = furnished_splat(home, walk, max(FINEST, spacing), rng)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
-        return LabeledPart(name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook)
+        return LabeledPart(
+            name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook, voxel=voxel
+        )

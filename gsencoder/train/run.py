@@ -296,6 +296,7 @@ def room_stream(
         config.rooms,
         codebook,
         dict(zip(kinds(), codes.tolist(), strict=True)),
+        config.sampling,
         voxel=config.model.voxel,
         teachers=len(recipe.teachers),
         teacher=number,

@@ -54,6 +54,13 @@ class SamplingConfig(CheckedConfig):
         ge=0,
         le=2,
     )
+    coarsest: float = option(
+        1.0, "largest edge of a sample's token grid, log-uniform from model.voxel, as a multiple of it", ge=1, le=16
+    )
+
+    def draw_voxel(self, voxel: float, rng: np.random.Generator) -> float:
+        """Draws the edge of a token grid."""
+        return voxel * self.coarsest ** rng.random() if self.coarsest > 1 else voxel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -373,7 +380,7 @@ class Sample(NamedTuple):
 
 def join_samples(samples: Sequence[Sample], patch: int) -> Batch:
     """Joins samples to a batch; `patch` is the largest number of tokens in a patch of the encoder."""
-    sizes = [len(sample.attributes) for sample in samples]
+    sizes = [len(sample.plan.token_of) for sample in samples]
     starts = [sum(sizes[:i]) for i in range(len(sizes))]
     return Batch(
         names=tuple(sample.name for sample in samples),
@@ -541,20 +548,27 @@ def make_sample(
     views, selected = choose_crop(source.means, source.cameras, center_weights, recipe.sampling, size, rng)
     augmentation = recipe.augmentation
     remaining = drop_random(selected, augmentation.drop, rng) if augmentation is not None else selected
-    voxel = recipe.encoder.voxel / (source.metres_per_unit or 1.0)
+    metres = source.voxel or recipe.sampling.draw_voxel(recipe.encoder.voxel, rng)
+    voxel = metres / (source.metres_per_unit or 1.0)
     gaussians = upright_gaussians(source.gaussians(remaining), source.up, floor_of=source.means)
     if augmentation is not None:
         gaussians = augment(gaussians, rng, augmentation, voxel=voxel)
-    attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
+    attributes, opacities, plan = encoder_inputs(gaussians, replace(recipe.encoder, voxel=metres), voxel)
+    # Gaussians of one class in one token have one prediction and one target: one of them enters the loss for all.
+    rows, shares = np.arange(len(remaining)), None
+    if source.labeled:
+        keys = plan.token_of.numpy() * (first_codes.max() + 1) + first_codes[remaining]
+        _, rows, shares = np.unique(keys, return_index=True, return_inverse=True)
+        plan = plan._replace(token_of=plan.token_of[rows])
     return Sample(
         name=f"{scene.name} ({', '.join(source.view_names[view] for view in views)})",
         attributes=attributes,
         opacities=opacities,
         plan=plan,
         teachers=tuple(
-            no_targets(len(remaining), teacher.channels)
+            no_targets(len(rows), teacher.channels)
             if part is None or part_codes is None
-            else _targets_of(part, part_codes, teacher, recipe.losses, views, selected, remaining)
+            else _targets_of(part, part_codes, teacher, recipe.losses, views, selected, remaining, rows, shares)
             for part, part_codes, teacher in zip(scene.parts, codes, recipe.teachers, strict=True)
         ),
     )
@@ -578,15 +592,23 @@ def _targets_of(
     views: Sequence[int],
     selected: Int64[np.ndarray, " s"],
     remaining: Int64[np.ndarray, " n"],
+    rows: Int64[np.ndarray, " m"],
+    shares: Int64[np.ndarray, " n"] | None,
 ) -> TeacherTargets:
-    """The targets of one teacher for the remaining Gaussians, and its rows in the views."""
-    rows = [empty_rows(teacher.channels)]
-    for view in views if losses.render_weight and teacher.weight else ():
-        view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
-        rows.append(make_render_rows(view_rows, teacher.codebook, losses.rarity))
+    """The targets of one teacher for those of the remaining Gaussians that enter the loss, and its rows in the views.
+    Gaussian i of a splat with labels enters it as output shares[i], and without photographs there are no rows."""
+    classes = codes[remaining].astype(np.int64)
+    weights = rarity_weights(classes, losses.rarity)
+    rendered = [empty_rows(teacher.channels)]
+    if shares is not None:
+        weights = np.bincount(shares, weights).astype(np.float32)
+    elif losses.render_weight and teacher.weight:
+        for view in views:
+            view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
+            rendered.append(make_render_rows(view_rows, teacher.codebook, losses.rarity))
     return TeacherTargets(
-        targets=torch.from_numpy(scene.float16_targets(remaining)),
-        codes=torch.from_numpy(codes[remaining].astype(np.int64)),
-        loss_weights=torch.from_numpy(rarity_weights(codes[remaining], losses.rarity)),
-        rows=join_rows(rows, [0] * len(rows)),
+        targets=torch.from_numpy(scene.float16_targets(remaining[rows])),
+        codes=torch.from_numpy(classes[rows]),
+        loss_weights=torch.from_numpy(weights),
+        rows=join_rows(rendered, [0] * len(rendered)),
     )

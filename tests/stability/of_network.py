@@ -73,7 +73,8 @@ def codes_error(case: Case) -> float:
 def embed_error(case: Case) -> float:
     g, voxel = case.gaussians, Wide(case.voxel)
     arrays = (g.means, g.quats, g.scales, g.opacities, g.sh[:, 0])
-    got = embed(*map(torch.from_numpy, arrays), voxel=case.voxel, attributes=tuple(ATTRIBUTE_CHANNELS))
+    edges = {"voxel": case.voxel, "metres": case.voxel}
+    got = embed(*map(torch.from_numpy, arrays), **edges, attributes=tuple(ATTRIBUTE_CHANNELS))
     cells = g.means.astype(Wide) / voxel
     logs = np.clip(np.log(g.scales.astype(Wide) / voxel), -12, 12)
     rotation = oracles.rotations(g.quats)
@@ -89,6 +90,7 @@ def embed_error(case: Case) -> float:
         np.stack(entries, axis=1),
         np.clip(cells[:, 2:] / 50 - 1, -2, 2),
         np.clip(cells[:, 2:] / 5 - 1, -1, 1),
+        np.full((len(cells), 1), np.log2(voxel / Wide(0.05))),
     ]
     return worst(got, np.concatenate(want, axis=1), 1)
 

@@ -1,21 +1,33 @@
 """Rooms that are made during a training: they depend on the number of the sample, and have the teacher's labels."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from furniture import write_library
 from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.furnished.kinds import kinds
 from gsencoder.data.furnished.library import load_libraries
+from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.loop import micro_batches
-from gsencoder.train.losses import LossConfig, TeacherRecipe
+from gsencoder.train.losses import Distillation, LossConfig, TeacherRecipe
 from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.train.rooms import RoomStream, models_of
-from gsencoder.train.samples import Augmentation, RoomsConfig, SampleDataset, SampleRecipe, SamplingConfig
+from gsencoder.train.samples import (
+    Augmentation,
+    RoomsConfig,
+    SampleDataset,
+    SampleRecipe,
+    SamplingConfig,
+    TrainingScene,
+    join_samples,
+    make_sample,
+)
 
 CODE_OF = {kind: number for number, kind in enumerate(kinds())}
 CODEBOOK = np.random.default_rng(0).normal(size=(len(CODE_OF), 6)).astype(np.float32)
@@ -66,6 +78,38 @@ def test_targets_are_the_vectors_of_the_labels(library: Path) -> None:
     np.testing.assert_array_equal(targets.targets.numpy(), CODEBOOK[codes].astype(np.float16))
     assert (targets.loss_weights > 0).all()
     assert len(targets.rows.row_weights) == 0
+
+
+def test_gaussians_of_one_class_in_one_token_enter_the_loss_once_for_all(library: Path) -> None:
+    settings = recipe(
+        losses=LossConfig(contrast_weight=1.0, render_weight=0.0), encoder=replace(SMALL, voxel=0.3), augmentation=None
+    )
+    scene, codes = stream(library).scene(0)
+    every = TrainingScene([replace(scene.first, labeled=False)])
+    merged, plain = (make_sample(each, codes, settings, 2000, np.random.default_rng(0)) for each in (scene, every))
+    assert len(merged.teachers[0].codes) < len(plain.teachers[0].codes) == len(plain.attributes)
+    torch.manual_seed(0)
+    encoder = GaussianEncoder(settings.encoder, CODEBOOK.shape[1]).eval()
+    found = []
+    for sample in (merged, plain):
+        batch = join_samples([sample, sample], settings.encoder.transformer.patch)
+        loss = Distillation(encoder, settings.losses, settings.teachers)
+        total = sum(value / loss.divisors(batch)[name] for name, value in loss(batch).items())
+        found.append([total, *torch.autograd.grad(total, list(encoder.parameters()))])
+    for ours, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_cells_are_drawn_for_each_room_and_seeds_are_as_dense_as_they_ask(library: Path) -> None:
+    coarse = SamplingConfig(coarsest=4.0)
+    rooms = RoomStream(RoomsConfig(libraries=(str(library),)), CODEBOOK, CODE_OF, coarse, voxel=0.05)
+    voxels = [rooms.scene(number)[0].first.voxel for number in range(4)]
+    assert all(0.05 <= voxel <= 0.2 for voxel in voxels)
+    assert max(voxels) > 1.2 * min(voxels)
+    settings = recipe(encoder=replace(SMALL, voxel=0.05, inputs=("cell",)), sampling=coarse)
+    for number, voxel in enumerate(voxels):
+        inputs = SampleDataset([], settings, rooms)[number].attributes
+        np.testing.assert_allclose(inputs.numpy(), np.log2(voxel / 0.05), rtol=1e-5)
 
 
 def test_a_room_has_its_number_of_samples_before_the_next_takes_its_slot(library: Path) -> None:
