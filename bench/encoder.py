@@ -34,8 +34,8 @@ from gsencoder.models.plan import plan_cloud
 from gsencoder.models.transformer import (
     _append_zero_row,
     _by_cells,
-    _cell_neighbors,
     _gather_neighborhoods,
+    _pairs_by_cell,
     _row_blocks,
 )
 from gsencoder.types import FeatureSpace, Gaussians
@@ -103,8 +103,9 @@ class Recorded(TorchDispatchMode):
             padded, whole = _append_zero_row(x), weight.flatten(0, 1)
             for rows in _row_blocks(len(x), x.device):
                 if _by_cells(x):
-                    pairs = zip(weight, _cell_neighbors(neighbors[rows], len(x)), strict=True)
-                    self.products += [(torch.mm, (x[cells], matrix), {}) for matrix, (_, cells) in pairs]
+                    _, cells, counts = _pairs_by_cell(neighbors[rows], len(x))
+                    parts = zip(x[cells].split(counts), weight, strict=True)
+                    self.products += [(torch.mm, part, {}) for part in parts]
                 else:
                     self.products.append((torch.mm, (_gather_neighborhoods(padded, neighbors[rows]), whole), {}))
         if name in PRODUCTS:

@@ -9,7 +9,6 @@ can be left out.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -77,8 +76,12 @@ def convolve(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
     if _by_cells(x):
         total = x.new_zeros(len(x), weight.shape[2], dtype=torch.promote_types(x.dtype, torch.float32))
         for rows in _row_blocks(len(x), x.device):
-            for matrix, (present, cells) in zip(weight, _cell_neighbors(neighbors[rows], len(x)), strict=True):
-                total[rows].index_add_(0, present, (x.index_select(0, cells) @ matrix).to(total.dtype))
+            present, cells, counts = _pairs_by_cell(neighbors[rows], len(x))
+            products = x.new_empty(len(cells), weight.shape[2])
+            parts = zip(x.index_select(0, cells).split(counts), weight, products.split(counts), strict=True)
+            for gathered, matrix, product in parts:
+                torch.mm(gathered, matrix, out=product)
+            total[rows].index_add_(0, present, products.to(total.dtype))
         return total.to(x.dtype)
     padded, matrix = _append_zero_row(x), weight.flatten(0, 1)
     out = x.new_empty(len(x), matrix.shape[1])
@@ -103,8 +106,10 @@ def convolve_weight_gradient(x: Tensor, neighbors: Tensor, grad: Tensor) -> Tens
     )
     if _by_cells(x):
         for rows in _row_blocks(len(x), x.device):
-            for sums, (present, cells) in zip(total, _cell_neighbors(neighbors[rows], len(x)), strict=True):
-                sums += x.index_select(0, cells).T @ grad[rows].index_select(0, present)
+            present, cells, counts = _pairs_by_cell(neighbors[rows], len(x))
+            inputs, grads = x.index_select(0, cells), grad[rows].index_select(0, present)
+            for sums, of_inputs, of_grads in zip(total, inputs.split(counts), grads.split(counts), strict=True):
+                sums += of_inputs.T @ of_grads
         return total.to(x.dtype)
     padded = _append_zero_row(x)
     for rows in _row_blocks(len(x), x.device):
@@ -138,11 +143,13 @@ def _by_cells(x: Tensor) -> bool:
     return x.device.type == "cpu" and x.shape[1] >= MANY_CHANNELS
 
 
-def _cell_neighbors(neighbors: Tensor, tokens: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """For each cell of the neighborhood the rows that have a neighbor there, and the neighbors."""
-    for column in neighbors.T.contiguous():
-        rows = torch.nonzero(column < tokens).squeeze(1)
-        yield rows, column.index_select(0, rows)
+def _pairs_by_cell(neighbors: Tensor, tokens: int) -> tuple[Tensor, Tensor, list[int]]:
+    """The rows that have a neighbor in the first cell of the neighborhood, then in the second, …, these neighbors, and
+    the number of pairs of each cell."""
+    columns = neighbors.T.contiguous()
+    occupied = columns < tokens
+    found = torch.nonzero(occupied.view(-1)).squeeze(1)
+    return found % len(neighbors), columns.view(-1).index_select(0, found), occupied.sum(dim=1).tolist()
 
 
 def _append_zero_row(x: Tensor) -> Tensor:
