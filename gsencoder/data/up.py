@@ -265,6 +265,14 @@ def upright_gaussians(
     return replace(gaussians, means=gaussians.means - shift)
 
 
+def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
+    """The splat in another unit of length."""
+    if factor == 1:
+        return gaussians
+    means, scales = (values.astype(np.float64) * factor for values in (gaussians.means, gaussians.scales))
+    return replace(gaussians, means=means.astype(np.float32), scales=scales.astype(np.float32))
+
+
 def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float) -> Gaussians:
     """The splat, with colors of degree 0, after x → scale · to_from · x, where `to_from` is a rotation, or one with a
     mirror."""

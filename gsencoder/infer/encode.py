@@ -21,7 +21,7 @@ from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.core.settings import CheckedConfig, option
 from gsencoder.core.threads import ahead
-from gsencoder.data.up import upright_gaussians
+from gsencoder.data.up import scaled, upright_gaussians
 from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
 from gsencoder.models.grid import cut_scene_curves
@@ -62,6 +62,9 @@ class EncodeConfig(CheckedConfig):
         "auto", "type that the encoder computes in; auto = bfloat16 on a CPU that multiplies it, else float32"
     )
     device: Device = option("auto", "where the encoder computes")
+    grids: tuple[float, ...] = option(
+        (), "edges of token grids, metres, whose outputs are averaged; empty = those of the weights", gt=0, lt=math.inf
+    )
 
 
 class Encoder:
@@ -151,19 +154,42 @@ class Encoder:
         up: Float64[np.ndarray, "3"] | None,
         track: Track,
     ) -> dict[str, GaussianFeatures]:
-        """Chunk by chunk. Each region is a scene of its own: its features do not depend on what else the splat
-        holds."""
+        """The mean of the outputs on each token grid."""
         check_unit(metres_per_unit, "metres_per_unit")
         if not len(gaussians):
             raise InputError("encode: the splat has no Gaussians")
         if up is not None:
             gaussians = upright_gaussians(gaussians, up)
-        header, voxel = self.network.header, self.voxel / metres_per_unit
+        gaussians = scaled(gaussians, metres_per_unit)
+        grids = config.grids or tuple(self.voxel * factor for factor in (1.0, *self.network.header.coarser))
+        # An array for each space, since they are gigabytes, which are not copied.
+        columns = {teacher: self.outputs.columns[teacher] for teacher in teachers}
+        values: dict[str, Float32[np.ndarray, "N _channels"]] = {
+            teacher: np.zeros((len(gaussians), part.stop - part.start), np.float32) for teacher, part in columns.items()
+        }
+        for grid in grids:
+            bad = 0
+            for rows, features in self._on_grid(gaussians, grid, config, track):
+                bad += int((~np.isfinite(features).all(axis=1)).sum())
+                for teacher, part in columns.items():
+                    values[teacher][rows] += features[:, part] / len(grids)
+            if bad:
+                raise InputError(f"encode: {bad} of {len(gaussians)} features are not finite; try precision=float32")
+        return {
+            teacher: self.outputs[teacher].features(each, self._confidence(teacher, each, gaussians.means))
+            for teacher, each in values.items()
+        }
+
+    def _on_grid(
+        self, gaussians: Gaussians, voxel: float, config: EncodeConfig, track: Track
+    ) -> Iterator[tuple[Int64[np.ndarray, " n"], Float32[np.ndarray, "n channels"]]]:
+        """Rows and their restored outputs, chunk by chunk. Each region is a scene of its own: its features do not
+        depend on what else the splat holds."""
+        header = self.network.header
         run = self.network.runner(config.precision, config.device, voxel)
         regions = scene_regions(gaussians.means, voxel)
-        parts = _cut_regions(gaussians.means, regions, config.chunk, config.halo / metres_per_unit)
-        chunks = list(track(parts, "cutting into chunks"))
-        _warn_of_work(chunks, len(gaussians), config, metres_per_unit)
+        chunks = list(track(_cut_regions(gaussians.means, regions, config.chunk, config.halo), "cutting into chunks"))
+        _warn_of_work(chunks, len(gaussians), config)
         # Attention follows the curve of the complete region, wherever it is cut.
         curves = {
             region: cut_scene_curves(
@@ -182,35 +208,21 @@ class Encoder:
             subset = gaussians if len(chunks) == 1 else gaussians.select(chunk.rows)
             return run(subset, curves.get(chunk.region), len(chunk.core_rows))
 
-        # An array for each space, since they are gigabytes, which are not copied.
-        columns = {teacher: self.outputs.columns[teacher] for teacher in teachers}
-        values: dict[str, Float32[np.ndarray, "N _channels"]] = {
-            teacher: np.zeros((len(gaussians), part.stop - part.start), np.float32) for teacher, part in columns.items()
-        }
-        bad = 0
         # Checking and storing a chunk takes one thread, while the next one is computed.
         numbers = range(len(chunks))
         computed = ahead(run_chunk, numbers) if len(chunks) > 1 else map(run_chunk, numbers)
         for chunk, features in zip(track(chunks, "encoding"), computed, strict=True):
-            bad += int((~np.isfinite(features).all(axis=1)).sum())
-            for teacher, part in columns.items():
-                values[teacher][chunk.core_rows] = features[:, part]
-        if bad:
-            raise InputError(f"encode: {bad} of {len(gaussians)} features are not finite; try precision=float32")
-        return {
-            teacher: self.outputs[teacher].features(each, self._confidence(teacher, each, regions))
-            for teacher, each in values.items()
-        }
+            yield chunk.core_rows, features
 
     def _confidence(
-        self, teacher: str, restored: Float32[np.ndarray, "N channels"], regions: Int64[np.ndarray, " N"]
+        self, teacher: str, restored: Float32[np.ndarray, "N channels"], means: Float32[np.ndarray, "N 3"]
     ) -> Float32[np.ndarray, " N"] | None:
         """See `name_confidence`; None where the weights or the words beside them do not say enough."""
         outputs, words = self.outputs[teacher], self.tables.get(teacher)
         if not outputs.confidence or words is None or not words.trained:
             return None
         odds = name_odds(outputs, words.embeddings[[words.names.index(name) for name in words.trained]], restored)
-        return name_confidence(odds, regions, outputs.confidence)
+        return name_confidence(odds, scene_regions(means, self.voxel), outputs.confidence)
 
     def export(self, path: str | Path) -> None:
         """Writes the encoder as one ONNX file in float32, which runs without torch, after comparing the two."""
@@ -380,12 +392,12 @@ def _cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> Iterator
         ]
 
 
-def _warn_of_work(chunks: Sequence[Chunk], count: int, config: EncodeConfig, metres_per_unit: float) -> None:
+def _warn_of_work(chunks: Sequence[Chunk], count: int, config: EncodeConfig) -> None:
     """Warns where chunks take many times the work of one pass over a scene of `count` Gaussians."""
     seen = sum(len(chunk.rows) for chunk in chunks)
     work = seen + WORK_OF_CHUNK * len(chunks)
     if work > MUCH_WORK and work > MANY_TIMES * count:
-        narrow = sum(chunk.halo * metres_per_unit < 0.99 * config.halo for chunk in chunks)
+        narrow = sum(chunk.halo < 0.99 * config.halo for chunk in chunks)
         narrower = f"; {narrow:,} of them have no room for a halo of {config.halo:g} m and see less" if narrow else ""
         warnings.warn(
             f"encode.chunk={config.chunk}: {len(chunks):,} chunks, which with their halos hold {seen:,} Gaussians, "

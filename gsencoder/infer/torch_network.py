@@ -31,6 +31,7 @@ class TorchNetwork:
         self.module, shape = module, module.config.transformer
         self.header = EncoderHeader(
             voxel=module.config.voxel,
+            coarser=module.config.coarser,
             levels=shape.levels,
             orders=shape.orders,
             patch=shape.patch,

@@ -39,6 +39,9 @@ class EncoderConfig:
     """Inputs, token grid and network of an encoder."""
 
     voxel: float = option(0.02, "edge length of the token grid's cells, metres", gt=0)
+    coarser: tuple[float, ...] = option(
+        (), "further token grids on which a splat is encoded, whose outputs are averaged, as multiples of voxel", gt=1
+    )
     inputs: tuple[Attribute, ...] = option(
         ("offset", "color", "opacity", "scale", "rotation"), "Gaussian attributes that the encoder sees"
     )
@@ -160,7 +163,7 @@ def encoder_inputs(
     """The inputs of an encoder for one cloud: attributes, opacities and plan.
 
     Args:
-        voxel: edge length of the token grid's cells in units of the cloud (`config.voxel` is in metres).
+        voxel: edge length of the token grid's cells in units of the cloud, metres.
         scene_curves: patch boundaries of the full scene if the cloud is a part of one; None = it is the full scene.
     """
 
@@ -175,7 +178,6 @@ def encoder_inputs(
         opacities,
         tensor(gaussians.sh[:, 0]),
         voxel=voxel,
-        metres=config.voxel,
         attributes=config.inputs,
     )
     network = config.transformer
@@ -254,7 +256,8 @@ def load_start(config: EncoderConfig, source: str | Path) -> tuple[GaussianEncod
     """Reads weights to start from, and checks that they are of a network with these settings."""
     trained, spaces, _ = load_weights(source, "init")
     theirs, ours = (
-        asdict(replace(each, transformer=replace(each.transformer, drop_path=0.0))) for each in (trained.config, config)
+        asdict(replace(each, coarser=(), transformer=replace(each.transformer, drop_path=0.0)))
+        for each in (trained.config, config)
     )
     if theirs != ours:
         difference = first_difference({"model": theirs}, {"model": ours})

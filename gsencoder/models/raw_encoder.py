@@ -61,16 +61,14 @@ class RawEncoder(nn.Module):
         """Predicts features of a cloud of one or more Gaussians: coordinates in the basis, or vectors, of each space.
 
         Args:
-            voxel: edge length of the finest grid's cells, world units. An input, since the exporter would round a
-                constant to float32, which moves Gaussians near a border to another cell.
+            voxel: edge length of the finest grid's cells in units of the cloud, metres. An input, since the exporter
+                would round a constant to float32, which moves Gaussians near a border to another cell.
             corner: lowest corner of the full scene if the cloud is a part of one (`SceneCurves.corner`), else +inf.
             starts: first codes of the patches of the full scene (`SceneCurves.starts`), a row for each order of each
                 level in turn, padded with `INVALID_CODE`; negative if the cloud is the full scene.
         """
         config = self.encoder.config
-        attributes = embed(
-            means, quats, scales, opacities, sh_dc, voxel=voxel, metres=config.voxel, attributes=config.inputs
-        )
+        attributes = embed(means, quats, scales, opacities, sh_dc, voxel=voxel, attributes=config.inputs)
         plan = _plan_cloud(means, voxel, corner, starts, config.transformer, config.stem)
         standard: Tensor = self.encoder(attributes, opacities, plan)
         return standard * self.get_buffer("unit") + self.get_buffer("offset")

@@ -485,7 +485,6 @@ def embed(
     sh_dc: Float[Tensor, "N 3"],
     *,
     voxel: float | Float[Tensor, ""],
-    metres: float,
     attributes: tuple[Attribute, ...],
 ) -> Float[Tensor, "N C"]:
     """The input channels, all of order one, concatenated in the order of `attributes`.
@@ -494,8 +493,8 @@ def embed(
     ±2. opacity: −1 to 1. scale: ¼ of log(scale / voxel), largest first. rotation: ¼ of the six distinct entries of
     R diag(log s − mean log s) Rᵀ, the off-diagonal ones times √2, so that distances between inputs are Frobenius
     distances between matrices. height: z above the floor in 50 voxels and in 5, less 1, clamped to ±2 and ±1; z must be
-    up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). cell: log₂ of the voxel in metres over 5 cm. The
-    voxel, in world units, is a tensor in an exported graph, where it is an input; `metres` is the same edge in metres.
+    up and the floor at 0 (see `gsencoder.data.up.upright_gaussians`). cell: log₂ of the voxel over 0.05, which tells
+    its size in a splat in metres. The voxel is a tensor in an exported graph, where it is an input.
     """
     channels: list[Tensor] = []
     log_scales = torch.log(scales.double() / voxel).clamp(-MAX_ABS_LOG_SCALE, MAX_ABS_LOG_SCALE).to(means.dtype)
@@ -512,7 +511,8 @@ def embed(
             channels.append((cells / 50 - 1).clamp(-2, 2).to(means.dtype))
             channels.append((cells / 5 - 1).clamp(-1, 1).to(means.dtype))
         elif name == "cell":
-            channels.append(torch.full_like(means[:, :1], math.log2(metres / 0.05)))
+            size = math.log2(voxel / 0.05) if isinstance(voxel, float) else torch.log2(voxel / 0.05).to(means.dtype)
+            channels.append(torch.zeros_like(means[:, :1]) + size)
         elif name == "scale":
             channels.append(log_scales.sort(dim=1, descending=True).values / 4)
         else:

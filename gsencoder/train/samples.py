@@ -20,7 +20,7 @@ from torch.utils.data import Dataset
 
 from gsencoder.core.errors import InputError, error_prefix, listed
 from gsencoder.core.settings import CheckedConfig, option
-from gsencoder.data.up import turn, upright_gaussians
+from gsencoder.data.up import scaled, turn, upright_gaussians
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, join_plans
 from gsencoder.train.losses import TERMS, Batch, LossConfig, RenderRows, TeacherRecipe, TeacherTargets
@@ -209,7 +209,7 @@ def augment(
     voxel: float,
 ) -> Gaussians:
     """Applies random changes to an upright splat with colors of degree 0; row i of the result is Gaussian i. `drop` is
-    applied by `make_sample`, since it removes rows; the voxel, in world units, is the unit of `jitter` and `lift`."""
+    applied by `make_sample`, since it removes rows; the voxel, in metres, is the unit of `jitter` and `lift`."""
     axis = np.array([0.0, 0.0, 1.0])
     rotation = Rotation.from_rotvec(axis * math.radians(rng.uniform(-config.turn, config.turn)))
     horizontal = Rotation.from_rotvec(axis * rng.uniform(0, 2 * math.pi)).apply(perpendicular(axis))
@@ -548,12 +548,12 @@ def make_sample(
     views, selected = choose_crop(source.means, source.cameras, center_weights, recipe.sampling, size, rng)
     augmentation = recipe.augmentation
     remaining = drop_random(selected, augmentation.drop, rng) if augmentation is not None else selected
-    metres = source.voxel or recipe.sampling.draw_voxel(recipe.encoder.voxel, rng)
-    voxel = metres / (source.metres_per_unit or 1.0)
+    voxel = source.voxel or recipe.sampling.draw_voxel(recipe.encoder.voxel, rng)
     gaussians = upright_gaussians(source.gaussians(remaining), source.up, floor_of=source.means)
+    gaussians = scaled(gaussians, source.metres_per_unit or 1.0)
     if augmentation is not None:
         gaussians = augment(gaussians, rng, augmentation, voxel=voxel)
-    attributes, opacities, plan = encoder_inputs(gaussians, replace(recipe.encoder, voxel=metres), voxel)
+    attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
     # Gaussians of one class in one token have one prediction and one target: one of them enters the loss for all.
     rows, shares = np.arange(len(remaining)), None
     if source.labeled:

@@ -146,6 +146,20 @@ def test_the_unit_of_the_scene_is_taken_into_account() -> None:
     np.testing.assert_allclose(there.features, encode(one, network, WHOLE).features, atol=1e-4)
 
 
+def test_features_on_several_grids_are_the_mean_of_those_on_each() -> None:
+    torch.manual_seed(0)
+    of_size = replace(SMALL, inputs=("offset", "color", "cell"), coarser=(1.5, 2.0))
+    network, scene = GaussianEncoder(of_size, 5), random_gaussians(80, seed=2)
+    each = [encode(scene, network, replace(WHOLE, grids=(grid,))).decode() for grid in (0.1, 0.15, 0.2)]
+    assert np.abs(each[0] - each[2]).max() > 0.01
+    np.testing.assert_allclose(encode(scene, network, WHOLE).decode(), np.mean(each, axis=0), atol=1e-5)
+    chosen = encode(scene, network, replace(WHOLE, grids=(0.2, 0.1))).decode()
+    np.testing.assert_allclose(chosen, (each[0] + each[2]) / 2, atol=1e-5)
+    in_feet = replace(scene, means=scene.means / np.float32(0.25), scales=scene.scales / np.float32(0.25))
+    there = encode(in_feet, network, WHOLE, metres_per_unit=0.25).decode()
+    np.testing.assert_allclose(there, np.mean(each, axis=0), atol=1e-5)
+
+
 def seen_by(scene: Gaussians, config: EncodeConfig = WHOLE, unit: float = 1.0, **up: np.ndarray) -> list[Gaussians]:
     """What the network is run on."""
     network = Recording()

@@ -70,7 +70,8 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does_and_nea
 def test_a_graph_in_float16_gives_nearly_what_torch_gives_in_float32(several: Path) -> None:
     outputs = Encoder.load(str(several)).outputs
     torch.manual_seed(1)
-    module = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHALLOW), outputs.widths)
+    config = EncoderConfig(voxel=0.05, coarser=(2.0,), inputs=("offset", "color", "cell"), transformer=SHALLOW)
+    module = GaussianEncoder(config, outputs.widths)
     encoder = Encoder(TorchNetwork(module, outputs))
     with symbolic_sizes():
         graph = encoder.network.lower(half=True)

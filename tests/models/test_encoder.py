@@ -102,7 +102,7 @@ def test_one_ellipsoid_has_one_embedding_however_it_is_written() -> None:
     means, quats, scales, opacities = tensors
     sh = torch.from_numpy(one.sh[:, 0])
     names = tuple(ATTRIBUTE_CHANNELS)
-    plain = embed(means, quats, scales, opacities, sh, voxel=0.1, metres=0.1, attributes=names)
+    plain = embed(means, quats, scales, opacities, sh, voxel=0.1, attributes=names)
     # Turning the Gaussian's own frame by a third of a turn about its diagonal renames x, y, z as y, z, x.
     third = Rotation.from_quat([0.5] * 4)
     renamed = (Rotation.from_quat(one.quats, scalar_first=True) * third).as_quat(scalar_first=True)
@@ -111,14 +111,14 @@ def test_one_ellipsoid_has_one_embedding_however_it_is_written() -> None:
     original = rotmats_from_quats(quats) * scales.unsqueeze(1)
     torch.testing.assert_close(turned @ turned.mT, original @ original.mT, rtol=1e-4, atol=1e-7)
     for other, sizes in ((-quats, scales), (renamed, scales[:, [1, 2, 0]])):
-        again = embed(means, other, sizes, opacities, sh, voxel=0.1, metres=0.1, attributes=names)
+        again = embed(means, other, sizes, opacities, sh, voxel=0.1, attributes=names)
         torch.testing.assert_close(again, plain, rtol=1e-5, atol=1e-5)
 
 
 def test_heights_are_in_units_of_fifty_and_of_five_voxels_above_the_floor() -> None:
     z, others = torch.tensor([[-80.0], [0.0], [4.0], [40.0], [200.0]]), torch.rand(5, 4)
     means = 0.02 * torch.cat([others[:, :2], z], dim=1)
-    heights = embed(means, others, others[:, :3], z[:, 0], means, voxel=0.02, metres=0.02, attributes=("height",))
+    heights = embed(means, others, others[:, :3], z[:, 0], means, voxel=0.02, attributes=("height",))
     torch.testing.assert_close(heights, torch.tensor([[-2, -1], [-1, -1], [-0.92, -0.2], [-0.2, 1], [2, 1]]))
 
 

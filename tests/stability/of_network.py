@@ -73,8 +73,7 @@ def codes_error(case: Case) -> float:
 def embed_error(case: Case) -> float:
     g, voxel = case.gaussians, Wide(case.voxel)
     arrays = (g.means, g.quats, g.scales, g.opacities, g.sh[:, 0])
-    edges = {"voxel": case.voxel, "metres": case.voxel}
-    got = embed(*map(torch.from_numpy, arrays), **edges, attributes=tuple(ATTRIBUTE_CHANNELS))
+    got = embed(*map(torch.from_numpy, arrays), voxel=case.voxel, attributes=tuple(ATTRIBUTE_CHANNELS))
     cells = g.means.astype(Wide) / voxel
     logs = np.clip(np.log(g.scales.astype(Wide) / voxel), -12, 12)
     rotation = oracles.rotations(g.quats)

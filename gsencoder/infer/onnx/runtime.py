@@ -54,6 +54,7 @@ class EncoderHeader:
 
     Attributes:
         voxel: edge of the finest grid, metres.
+        coarser: further grids, whose outputs are averaged with those on it, as multiples of the voxel.
         patch: most tokens in a patch.
         outputs: what the features mean; the graph has restored them already.
         tables: what turns words into their spaces, by teacher, where there are such tables.
@@ -61,6 +62,7 @@ class EncoderHeader:
     """
 
     voxel: float
+    coarser: tuple[float, ...] = ()
     levels: int
     orders: tuple[Order, ...]
     patch: int
@@ -91,6 +93,7 @@ def to_metadata(header: EncoderHeader) -> dict[str, str]:
     values |= {
         "version": VERSION if len(header.outputs) == 1 else VERSION_OF_SEVERAL,
         "voxel": header.voxel,
+        "coarser": list(header.coarser),
         "levels": header.levels,
         "orders": list(header.orders),
         "patch": header.patch,
@@ -163,6 +166,7 @@ def from_metadata(entries: Mapping[str, str]) -> EncoderHeader:
                 tables[teacher] = _text_table(part["words"], arrays)
         return EncoderHeader(
             voxel=float(values["voxel"]),
+            coarser=tuple(map(float, values.get("coarser", ()))),
             levels=values["levels"],
             orders=tuple(values["orders"]),
             patch=values["patch"],
@@ -267,7 +271,7 @@ class Network(Protocol):
         """The types that it computes in on a device, the most exact one first; others than that are cheaper."""
 
     def runner(self, precision: Precision, device: Device, voxel: float) -> Run:
-        """Prepares to run on a splat, in whose unit of length the finest grid has cells of `voxel`."""
+        """Prepares to run on a splat in metres, whose finest grid has cells of `voxel`."""
 
     def lower(self, *, half: bool = False) -> Any:
         """The network as an ONNX graph; see `gsencoder.infer.onnx.export.lower`."""
