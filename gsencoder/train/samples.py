@@ -182,7 +182,8 @@ def drop_random(rows: Int64[np.ndarray, " n"], max_share: float, rng: np.random.
 class Augmentation:
     """Strengths of the random changes to a training sample; 0 = none."""
 
-    turn: float = 180.0  # largest rotation about the up axis in either direction, degrees
+    turn: float = 4.0  # standard deviation of the angle of walls after a quarter turn about up, degrees; 0 = none
+    askew: float = 0.15  # probability of any other angle
     tilt: float = 3.0  # standard deviation of the tilt of the up axis, degrees
     mirror: float = 0.5  # probability
     scale: float = 0.1  # largest relative change of size
@@ -211,7 +212,10 @@ def augment(
     """Applies random changes to an upright splat with colors of degree 0; row i of the result is Gaussian i. `drop` is
     applied by `make_sample`, since it removes rows; the voxel, in metres, is the unit of `jitter` and `lift`."""
     axis = np.array([0.0, 0.0, 1.0])
-    rotation = Rotation.from_rotvec(axis * math.radians(rng.uniform(-config.turn, config.turn)))
+    angle = rng.normal(0, config.turn) + (90 * rng.integers(4) if config.turn else 0)
+    if rng.random() < config.askew:
+        angle += rng.uniform(-45, 45)
+    rotation = Rotation.from_rotvec(axis * math.radians(angle))
     horizontal = Rotation.from_rotvec(axis * rng.uniform(0, 2 * math.pi)).apply(perpendicular(axis))
     rotation = Rotation.from_rotvec(horizontal * math.radians(rng.normal(0, config.tilt))) * rotation
     to_from = rotation.as_matrix()

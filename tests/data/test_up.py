@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 from field_scenes import FieldRoom, cam_from_world, store_turned, write_colmap_text, write_transforms
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image, ImageOps
 from scene_files import photograph
 from scipy.spatial.transform import Rotation
@@ -18,6 +20,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.enclosure import Surfaces, surfaces_of_gaussians
 from gsencoder.data.readers.images import picture_info, read_rgba
 from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.seeding.points import quats_from_normals
 from gsencoder.data.synthetic import make_room
 from gsencoder.data.up import (
     Up,
@@ -25,9 +28,11 @@ from gsencoder.data.up import (
     _refine,
     _support,
     estimate_up,
+    turn,
     up_of_cameras,
     up_of_scene,
     upright_gaussians,
+    wall_angle,
     with_up,
 )
 from gsencoder.fusion.checkpoint import upright
@@ -443,6 +448,27 @@ def test_views_for_people_and_models_are_upright(field_room, tmp_path):
     assert all(np.abs(each.astype(int) - picture).mean() < 25 for each, picture in zip(rendered, pictures, strict=True))
 
 
+@given(st.floats(-np.pi, np.pi), st.integers(0, 9))
+@settings(max_examples=20)
+def test_walls_of_an_upright_splat_lie_along_its_axes_however_it_stood(angle: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    normals = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)[rng.integers(0, 3, 500)]
+    normals += rng.normal(0, 0.2, normals.shape).astype(np.float32)
+    room = random_gaussians(500)
+    room = replace(room, quats=quats_from_normals(normals), scales=np.tile(np.float32([0.05, 0.05, 0.001]), (500, 1)))
+    rotated = turn(room, Rotation.from_euler("z", angle).as_matrix(), 1.0)
+    off = wall_angle(rotated) - wall_angle(room) - angle
+    assert abs((off + np.pi / 4) % (np.pi / 2) - np.pi / 4) < 1e-4
+    assert abs(wall_angle(room)) < 0.05
+    assert abs(wall_angle(upright_gaussians(rotated, None))) < 1e-4
+
+
+def test_a_splat_without_walls_is_not_turned() -> None:
+    one = random_gaussians(4000)
+    assert wall_angle(one) == 0.0
+    assert wall_angle(one.select(np.zeros(0, int))) == 0.0
+
+
 @pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (0.3, -0.5, 0.8)])
 def test_an_upright_splat_has_its_floor_at_zero_whichever_way_up_was(up: tuple[float, float, float] | None) -> None:
     one = random_gaussians(400, center=(0, 0, 0))
@@ -455,7 +481,7 @@ def test_an_upright_splat_has_its_floor_at_zero_whichever_way_up_was(up: tuple[f
         np.linalg.norm(standing.means[:, None] - standing.means[None], axis=-1), distances, atol=1e-3
     )
     part = upright_gaussians(one.select(np.arange(7)), None if up is None else np.array(up), floor_of=one.means)
-    np.testing.assert_allclose(part.means, standing.means[:7], atol=1e-5)
+    np.testing.assert_allclose(part.means[:, 2], standing.means[:7, 2], atol=1e-5)
     before, after = (
         covariances(torch.from_numpy(each.quats), torch.from_numpy(each.scales)).numpy() for each in (one, standing)
     )

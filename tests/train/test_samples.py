@@ -455,7 +455,7 @@ def test_with_every_amount_at_zero_nothing_changes_but_the_place_on_the_grid() -
 
 def test_heights_stay_but_for_the_tilt_and_a_floor_that_is_not_found() -> None:
     one = replace(splat(), means=splat().means + np.array([5, 2, 1], np.float32))
-    turned = augment(one, np.random.default_rng(3), replace(NOTHING, turn=180.0, mirror=1.0), voxel=0.0)
+    turned = augment(one, np.random.default_rng(3), replace(NOTHING, turn=30.0, askew=0.5, mirror=1.0), voxel=0.0)
     np.testing.assert_allclose(turned.means[:, 2], one.means[:, 2], atol=1e-4)
     moved = augment(one, np.random.default_rng(3), replace(NOTHING, lift=1.0), voxel=0.02)
     assert np.ptp(moved.means[:, 2] - one.means[:, 2]) < 1e-4
