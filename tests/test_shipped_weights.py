@@ -27,22 +27,22 @@ from gsencoder.types import GaussianFeatures, Scene
 
 pytestmark = pytest.mark.slow
 
-WEIGHTS = {"house_cpu": ["labels"], "house": ["labels", "dinov2_s14"]}
+WEIGHTS = {"rooms": ["labels"], "house": ["labels", "dinov2_s14"]}
 """The weights, and the teachers of each."""
 
 
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_they_are_small_and_say_how_they_were_made(name: str) -> None:
     folder = SHIPPED_WEIGHTS / name
-    assert sum(path.stat().st_size for path in folder.iterdir()) < 14e6
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 25e6
     _, outputs, made_by = load_weights(name)
     assert list(outputs) == WEIGHTS[name]
     tables = load_tables(folder, outputs)
     assert list(tables) == ["labels"]
     words = tables["labels"]
     assert outputs["labels"].space.text_encoder == words.space.text_encoder
-    assert len(words.trained or ()) == 63
-    assert (words.is_trained("mugs"), words.is_trained("zebra")) == (True, False)
+    assert len(words.trained or ()) >= 63
+    assert (words.is_trained("chairs"), words.is_trained("zebra")) == (True, False)
     assert made_by["steps"] == made_by["settings"]["train"]["steps"]
     assert not any(Path(path).is_absolute() for path in made_by["settings"]["paths"])
 
@@ -97,7 +97,7 @@ def test_an_unseen_room_is_named_and_found_by_phrases(shared: Path, monkeypatch:
 
 
 def test_an_unseen_room_is_named_in_parts_as_in_one(shared: Path) -> None:
-    encoder, scene = Encoder.load("house_cpu"), unseen_room(shared, 40, views=2)
+    encoder, scene = Encoder.load("rooms"), unseen_room(shared, 40, views=2)
     # Several parts, of which each has neighbors.
     assert len(scene.gaussians) > 2 * 10_000
     whole, parts = (encoder.encode(scene.gaussians, EncodeConfig(chunk=chunk)) for chunk in (0, 10_000))

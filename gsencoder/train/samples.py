@@ -220,7 +220,7 @@ def augment(
     rotation = Rotation.from_rotvec(horizontal * math.radians(rng.normal(0, config.tilt))) * rotation
     to_from = rotation.as_matrix()
     if rng.random() < config.mirror:
-        to_from = to_from @ (np.eye(3) - 2 * np.outer(horizontal, horizontal))
+        to_from = to_from @ np.diag([-1.0, 1.0, 1.0])
     # About the middle of the floor below it, so that a tilt does not lift it.
     middle = np.append(gaussians.means[:, :2].mean(axis=0), np.float32(0))
     centered = replace(gaussians, means=gaussians.means - middle)
