@@ -1,6 +1,6 @@
 """Memories of unseen rooms in one pass, beside dense features of the same encoder and beside fused ones.
 
-    python bench/feed_forward.py ROOM … [--weights rooms] [--bank-rooms ROOM …]
+    python bench/feed_forward.py ROOM … [--weights house_cpu] [--bank-rooms ROOM …]
 
 An encoder predicts features of each room; its queries are their principal coordinates. They attend to a bank of the
 room's own views, which the labels teacher has looked at, so that it holds the names that are in the room; or to one of
@@ -50,7 +50,7 @@ def maps_of(scenes: list[tuple[Scene, Teacher]]) -> MapStream:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rooms", nargs="+", type=Path)
-    parser.add_argument("--weights", default="rooms")
+    parser.add_argument("--weights", default="house_cpu")
     parser.add_argument("--bank-rooms", nargs="*", default=[], type=Path)
     parser.add_argument("--optimize", action="store_true", help="also optimize a memory of each room")
     add_json_option(parser)

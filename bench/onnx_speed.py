@@ -1,6 +1,6 @@
 """An exported encoder under onnxruntime beside the same under torch: seconds, memory, and how soon the first answer.
 
-    python bench/onnx_speed.py MODEL.onnx SCENE [--weights rooms] [--sizes 20000,100000]
+    python bench/onnx_speed.py MODEL.onnx SCENE [--weights house_cpu] [--sizes 20000,100000]
 
 Each figure is of a process of its own, which reads the model, encodes the Gaussians that are nearest to the middle of
 the scene once, and then again and again; the two take turns. Seconds are the best of the later passes, memory is the
@@ -49,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("model")
     parser.add_argument("scene")
-    parser.add_argument("--weights", default="rooms")
+    parser.add_argument("--weights", default="house_cpu")
     parser.add_argument("--sizes", default="20000,100000")
     parser.add_argument("--child", action="store_true")
     add_json_option(parser)

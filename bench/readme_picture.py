@@ -29,7 +29,7 @@ def main() -> None:
     given = parser.parse_args()
 
     scene = with_gaussians(load_scene(given.scene))
-    encoder = Encoder.load("rooms")
+    encoder = Encoder.load("house_cpu")
     features = encoder.encode(scene.gaussians)
     found = localize(replace(scene, features={features.space.name: features}), given.words.split(","), encoder.words)
 

@@ -1,6 +1,6 @@
 """Selected Gaussians beside the true ones of labeled rooms, and what is left of an object that was taken out.
 
-    python bench/selections.py ROOM … [--weights rooms] [--every 4] [--alone]
+    python bench/selections.py ROOM … [--weights house_cpu] [--every 4] [--alone]
     python bench/selections.py ROOM … --boxes [--splats FOLDER]
 
 Every n-th view of a room is left out; the others give seeds, and features of the labels teacher, and of an encoder.
@@ -201,7 +201,7 @@ def count_boxes(rooms: Sequence[Path], splats: Path | None) -> dict[str, dict[st
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rooms", nargs="+", type=Path)
-    parser.add_argument("--weights", default="rooms")
+    parser.add_argument("--weights", default="house_cpu")
     parser.add_argument("--every", type=int, default=4)
     parser.add_argument("--alone", action="store_true")
     parser.add_argument("--boxes", action="store_true")

@@ -1,7 +1,7 @@
 """Features of a splat in one pass, with the encoder that comes with gsencoder: no photographs, no teacher.
 
 gsencoder demo out=outputs/demo
-python examples/03_encode_a_splat.py outputs/demo/room table,chair
+python examples/03_encode_a_splat.py outputs/demo/room table,sofa
 """
 
 import sys
@@ -20,7 +20,7 @@ def main(folder: str, words: str) -> None:
     scene = replace(scene, gaussians=scene.gaussians or seed(scene))
 
     # The network sees means, rotations, scales, opacities and colors of the Gaussians, in metres.
-    encoder = Encoder.load("rooms")
+    encoder = Encoder.load("house_cpu")
     features = encoder.encode(scene.gaussians, metres_per_unit=scene.metres_per_unit or 1.0, up=scene.up)
     print(f"{len(features):,} features of {features.space.describe()}")
 
@@ -41,7 +41,7 @@ def main(folder: str, words: str) -> None:
     Image.fromarray(np.hstack([picture, colors])).save("encoded.png")
 
     # A folder of features is what `gsencoder localize`, `views`, `ask` and `pack` take.
-    save_features("encoded", scene, features, {"encoder": "rooms"})
+    save_features("encoded", scene, features, {"encoder": "house_cpu"})
     save_splat("room.ply", scene.gaussians)
     print("encoded.png: view 0, and its features as colors; encoded: the features; room.ply: the splat alone")
 

@@ -71,9 +71,9 @@ def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(run, room, 
 
 
 def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(run, room, tmp_path):
-    out = run(3, room, "table,chair")
+    out = run(3, room, "table,sofa")
     assert re.search(r"^[\d,]+ features of ", out)
-    assert re.findall(r"^(table|chair): \d+ boxes", out, re.MULTILINE) == ["table", "chair"]
+    assert re.findall(r"^(table|sofa): \d+ boxes", out, re.MULTILINE) == ["table", "sofa"]
     features = gsencoder.load_features(tmp_path / "encoded").features
     assert len(gsencoder.load_splat(tmp_path / "room.ply")) == len(features["labels-clip_vitb32"])
     assert size_of(tmp_path / "encoded.png") == (240, 90)

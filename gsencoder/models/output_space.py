@@ -242,7 +242,7 @@ def read_output_spaces(file: Archive) -> OutputSpaces:
 WEIGHTS_FILE = "encoder.safetensors"
 SHIPPED_WEIGHTS = Path(__file__).resolve().parent.parent / "weights"
 """Folder of the encoders that come with the package, one folder each."""
-DEFAULT_WEIGHTS = "rooms"
+DEFAULT_WEIGHTS = "house_cpu"
 """The one of them that is taken where none is named."""
 SHIPPED = "shipped:"
 """What a name of them begins with that cannot be taken for a path."""
