@@ -259,12 +259,12 @@ def upright_gaussians(
     means = gaussians.means if floor_of is None else floor_of
     axis = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, np.float64) / np.linalg.norm(up)
     heights = means[:: max(1, len(means) // FLOOR_SAMPLE)].astype(np.float64) @ axis
+    upright = np.eye(3)
     if axis[2] < 1 - 1e-9:
-        matrix = Rotation.align_vectors([[0, 0, 1]], [axis])[0].as_matrix()
-        gaussians = turn(gaussians, matrix, 1.0)
-    angle = wall_angle(gaussians)
-    if angle:
-        gaussians = turn(gaussians, Rotation.from_euler("z", -angle).as_matrix(), 1.0)
+        upright = Rotation.align_vectors([[0, 0, 1]], [axis])[0].as_matrix()
+    angle = wall_angle(gaussians, upright)
+    if angle or axis[2] < 1 - 1e-9:
+        gaussians = turn(gaussians, Rotation.from_euler("z", -angle).as_matrix() @ upright, 1.0)
     shift = np.array([0, 0, np.quantile(heights, FLOOR_QUANTILE)], np.float32)
     return replace(gaussians, means=gaussians.means - shift)
 
@@ -274,13 +274,13 @@ LEAST_MOMENT = 0.1
 """Smallest moment by which surfaces that stand have directions; of random ones it is 0, of a clean room 1."""
 
 
-def wall_angle(gaussians: Gaussians) -> float:
-    """The angle about z, −π/4 to π/4, at which walls stand, 0 where they have no direction: a quarter of that of
-    Σ area · (n_x + i n_y)⁴ over normals n, since walls stand at right angles to each other."""
+def wall_angle(gaussians: Gaussians, upright: Float64[np.ndarray, "3 3"]) -> float:
+    """The angle about z, −π/4 to π/4, at which walls stand after a rotation that turns up to z, 0 where they have no
+    direction: a quarter of that of Σ area · (n_x + i n_y)⁴ over normals n, since walls stand at right angles."""
     rows = slice(None, None, max(1, len(gaussians) // WALL_SAMPLE))
     scales = gaussians.scales[rows].astype(np.float64)
     axes = Rotation.from_quat(gaussians.quats[rows].astype(np.float64), scalar_first=True).as_matrix()
-    normals = np.take_along_axis(axes, scales.argmin(axis=1)[:, None, None], axis=2)[..., 0]
+    normals = np.take_along_axis(axes, scales.argmin(axis=1)[:, None, None], axis=2)[..., 0] @ upright.T
     weights = gaussians.opacities[rows] * np.sort(scales, axis=1)[:, 1:].prod(axis=1)
     powers = (normals[:, 0] + 1j * normals[:, 1]) ** 4
     total = float(weights @ np.abs(powers))

@@ -167,14 +167,20 @@ class Encoder:
         values: dict[str, Float32[np.ndarray, "N _channels"]] = {
             teacher: np.zeros((len(gaussians), part.stop - part.start), np.float32) for teacher, part in columns.items()
         }
-        for grid in grids:
+        for number, grid in enumerate(grids):
             bad = 0
             for rows, features in self._on_grid(gaussians, grid, config, track):
                 bad += int((~np.isfinite(features).all(axis=1)).sum())
                 for teacher, part in columns.items():
-                    values[teacher][rows] += features[:, part] / len(grids)
+                    if number:
+                        values[teacher][rows] += features[:, part]
+                    else:
+                        values[teacher][rows] = features[:, part]
             if bad:
                 raise InputError(f"encode: {bad} of {len(gaussians)} features are not finite; try precision=float32")
+        if len(grids) > 1:
+            for each in values.values():
+                each /= len(grids)
         return {
             teacher: self.outputs[teacher].features(each, self._confidence(teacher, each, gaussians.means))
             for teacher, each in values.items()

@@ -148,8 +148,8 @@ def _pairs_by_cell(neighbors: Tensor, tokens: int) -> tuple[Tensor, Tensor, list
     the number of pairs of each cell."""
     columns = neighbors.T.contiguous()
     occupied = columns < tokens
-    found = torch.nonzero(occupied.view(-1)).squeeze(1)
-    return found % len(neighbors), columns.view(-1).index_select(0, found), occupied.sum(dim=1).tolist()
+    pairs = torch.nonzero(occupied.view(-1)).squeeze(1)
+    return pairs % len(neighbors), columns.view(-1).index_select(0, pairs), occupied.sum(dim=1).tolist()
 
 
 def _append_zero_row(x: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ class LabeledPart(ScenePart):
     splat: LabeledSplat
     codes_of_rows: Int32[np.ndarray, " N"]
     codebook: Float32[np.ndarray, "C channels"]
-    voxel: float | None
+    voxel: float
     path: Path = Path()
     metres_per_unit: float | None = 1.0
     labeled: bool = True
@@ -124,7 +124,8 @@ class RoomStream:
 
         Args:
             codebook, code_of: vectors of the labels in standard units, and the row of each kind.
-            sampling, voxel: the largest cells in units of the encoder's, and the edge of these, metres.
+            sampling: how much coarser than the encoder's the cells of a room may be.
+            voxel: edge of the encoder's cells, metres.
             teachers, teacher: the number of teachers of the training, and which of them has the labels.
             step_samples: samples of a step over all processes.
         """

@@ -559,20 +559,20 @@ def make_sample(
         gaussians = augment(gaussians, rng, augmentation, voxel=voxel)
     attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
     # Gaussians of one class in one token have one prediction and one target: one of them enters the loss for all.
-    rows, shares = np.arange(len(remaining)), None
+    first = output_of = np.arange(len(remaining))
     if source.labeled:
         keys = plan.token_of.numpy() * (first_codes.max() + 1) + first_codes[remaining]
-        _, rows, shares = np.unique(keys, return_index=True, return_inverse=True)
-        plan = plan._replace(token_of=plan.token_of[rows])
+        _, first, output_of = np.unique(keys, return_index=True, return_inverse=True)
+        plan = plan._replace(token_of=plan.token_of[first])
     return Sample(
         name=f"{scene.name} ({', '.join(source.view_names[view] for view in views)})",
         attributes=attributes,
         opacities=opacities,
         plan=plan,
         teachers=tuple(
-            no_targets(len(rows), teacher.channels)
+            no_targets(len(first), teacher.channels)
             if part is None or part_codes is None
-            else _targets_of(part, part_codes, teacher, recipe.losses, views, selected, remaining, rows, shares)
+            else _targets_of(part, part_codes, teacher, recipe.losses, views, selected, remaining, first, output_of)
             for part, part_codes, teacher in zip(scene.parts, codes, recipe.teachers, strict=True)
         ),
     )
@@ -596,23 +596,19 @@ def _targets_of(
     views: Sequence[int],
     selected: Int64[np.ndarray, " s"],
     remaining: Int64[np.ndarray, " n"],
-    rows: Int64[np.ndarray, " m"],
-    shares: Int64[np.ndarray, " n"] | None,
+    first: Int64[np.ndarray, " m"],
+    output_of: Int64[np.ndarray, " n"],
 ) -> TeacherTargets:
-    """The targets of one teacher for those of the remaining Gaussians that enter the loss, and its rows in the views.
-    Gaussian i of a splat with labels enters it as output shares[i], and without photographs there are no rows."""
-    classes = codes[remaining].astype(np.int64)
-    weights = rarity_weights(classes, losses.rarity)
-    rendered = [empty_rows(teacher.channels)]
-    if shares is not None:
-        weights = np.bincount(shares, weights).astype(np.float32)
-    elif losses.render_weight and teacher.weight:
-        for view in views:
-            view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
-            rendered.append(make_render_rows(view_rows, teacher.codebook, losses.rarity))
+    """The targets of one teacher for the remaining Gaussians, and its rows in the views. Those that have one output and
+    one target enter the loss as the first of them, with the weights of all."""
+    rows = [empty_rows(teacher.channels)]
+    for view in views if losses.render_weight and teacher.weight else ():
+        view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
+        rows.append(make_render_rows(view_rows, teacher.codebook, losses.rarity))
+    weights = np.bincount(output_of, rarity_weights(codes[remaining], losses.rarity))
     return TeacherTargets(
-        targets=torch.from_numpy(scene.float16_targets(remaining[rows])),
-        codes=torch.from_numpy(classes[rows]),
-        loss_weights=torch.from_numpy(weights),
-        rows=join_rows(rendered, [0] * len(rendered)),
+        targets=torch.from_numpy(scene.float16_targets(remaining[first])),
+        codes=torch.from_numpy(codes[remaining[first]].astype(np.int64)),
+        loss_weights=torch.from_numpy(weights.astype(np.float32)),
+        rows=join_rows(rows, [0] * len(rows)),
     )

@@ -457,16 +457,18 @@ def test_walls_of_an_upright_splat_lie_along_its_axes_however_it_stood(angle: fl
     room = random_gaussians(500)
     room = replace(room, quats=quats_from_normals(normals), scales=np.tile(np.float32([0.05, 0.05, 0.001]), (500, 1)))
     rotated = turn(room, Rotation.from_euler("z", angle).as_matrix(), 1.0)
-    off = wall_angle(rotated) - wall_angle(room) - angle
+    off = wall_angle(rotated, np.eye(3)) - wall_angle(room, np.eye(3)) - angle
     assert abs((off + np.pi / 4) % (np.pi / 2) - np.pi / 4) < 1e-4
-    assert abs(wall_angle(room)) < 0.05
-    assert abs(wall_angle(upright_gaussians(rotated, None))) < 1e-4
+    assert abs(wall_angle(room, np.eye(3))) < 0.05
+    assert abs(wall_angle(upright_gaussians(rotated, None), np.eye(3))) < 1e-4
+    lying = turn(rotated, Rotation.from_euler("x", 90, degrees=True).as_matrix(), 1.0)
+    assert abs(wall_angle(upright_gaussians(lying, np.array([0.0, -1.0, 0.0])), np.eye(3))) < 1e-4
 
 
 def test_a_splat_without_walls_is_not_turned() -> None:
     one = random_gaussians(4000)
-    assert wall_angle(one) == 0.0
-    assert wall_angle(one.select(np.zeros(0, int))) == 0.0
+    assert wall_angle(one, np.eye(3)) == 0.0
+    assert wall_angle(one.select(np.zeros(0, int)), np.eye(3)) == 0.0
 
 
 @pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (0.3, -0.5, 0.8)])
@@ -481,7 +483,10 @@ def test_an_upright_splat_has_its_floor_at_zero_whichever_way_up_was(up: tuple[f
         np.linalg.norm(standing.means[:, None] - standing.means[None], axis=-1), distances, atol=1e-3
     )
     part = upright_gaussians(one.select(np.arange(7)), None if up is None else np.array(up), floor_of=one.means)
+    # A part is turned by its own walls.
     np.testing.assert_allclose(part.means[:, 2], standing.means[:7, 2], atol=1e-5)
+    apart = np.linalg.norm(part.means[:, None] - part.means[None], axis=-1)
+    np.testing.assert_allclose(apart, distances[:7, :7], atol=1e-3)
     before, after = (
         covariances(torch.from_numpy(each.quats), torch.from_numpy(each.scales)).numpy() for each in (one, standing)
     )

@@ -90,13 +90,13 @@ def test_gaussians_of_one_class_in_one_token_enter_the_loss_once_for_all(library
     assert len(merged.teachers[0].codes) < len(plain.teachers[0].codes) == len(plain.attributes)
     torch.manual_seed(0)
     encoder = GaussianEncoder(settings.encoder, CODEBOOK.shape[1]).eval()
-    found = []
+    results = []
     for sample in (merged, plain):
         batch = join_samples([sample, sample], settings.encoder.transformer.patch)
         loss = Distillation(encoder, settings.losses, settings.teachers)
         total = sum(value / loss.divisors(batch)[name] for name, value in loss(batch).items())
-        found.append([total, *torch.autograd.grad(total, list(encoder.parameters()))])
-    for ours, theirs in zip(*found, strict=True):
+        results.append([total, *torch.autograd.grad(total, list(encoder.parameters()))])
+    for ours, theirs in zip(*results, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
