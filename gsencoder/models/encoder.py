@@ -100,8 +100,9 @@ class GaussianEncoder(nn.Module):
         neighbors = plan.levels[0].neighbors if plan.stem_neighbors is None else plan.stem_neighbors
         x = functional.gelu(self.stem_norm(self.stem(tokens, neighbors)))
         x = self.transformer(x, plan)
-        features = self._output_features(x)
-        return features.index_select(0, plan.token_of)
+        if not torch.compiler.is_exporting() and len(plan.token_of) < len(plan.counts):
+            return self._output_features(x.index_select(0, plan.token_of))
+        return self._output_features(x).index_select(0, plan.token_of)
 
     def _output_features(self, x: Float[Tensor, "T C"]) -> Float[Tensor, "T channels"]:
         """The last norm and the projectors (or the linear layer), in float32 under autocast: in bfloat16 the outputs

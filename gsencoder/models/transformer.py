@@ -36,7 +36,8 @@ CPU_BLOCK_ROWS = 8192
 
 MANY_CHANNELS = 48
 """Input channels from which a convolution on a CPU multiplies the neighbors that exist, cell by cell, rather than whole
-neighborhoods. On a surface two cells in three are empty, but to find the others costs more than few channels save."""
+neighborhoods. On a surface two cells in three are empty, but to find the others costs more than few channels save; in
+bfloat16 it always costs more, since oneDNN prepares a product of a new size for each cell."""
 
 
 class NeighborConv(nn.Module):
@@ -140,7 +141,7 @@ convolve.register_autograd(_gradients, setup_context=_save_inputs)
 
 def _by_cells(x: Tensor) -> bool:
     """Whether to multiply cell by cell; see `MANY_CHANNELS`."""
-    return x.device.type == "cpu" and x.shape[1] >= MANY_CHANNELS
+    return x.device.type == "cpu" and x.dtype != torch.bfloat16 and x.shape[1] >= MANY_CHANNELS
 
 
 def _pairs_by_cell(neighbors: Tensor, tokens: int) -> tuple[Tensor, Tensor, list[int]]:

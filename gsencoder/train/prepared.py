@@ -192,8 +192,6 @@ class ScenePart(ABC):
     name: str
     voxel: float | None = None
     """Edge of the token grid that the Gaussians are meant for, metres; None = any."""
-    labeled: bool = False
-    """Whether the target of each Gaussian is the vector of its class."""
 
     @abstractmethod
     def __len__(self) -> int: ...

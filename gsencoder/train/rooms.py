@@ -46,7 +46,6 @@ class LabeledPart(ScenePart):
     voxel: float
     path: Path = Path()
     metres_per_unit: float | None = 1.0
-    labeled: bool = True
 
     def __len__(self) -> int:
         return len(self.splat.means)

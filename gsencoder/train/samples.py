@@ -558,24 +558,45 @@ def make_sample(
     if augmentation is not None:
         gaussians = augment(gaussians, rng, augmentation, voxel=voxel)
     attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
-    # Gaussians of one class in one token have one prediction and one target: one of them enters the loss for all.
-    first = output_of = np.arange(len(remaining))
-    if source.labeled:
-        keys = plan.token_of.numpy() * (first_codes.max() + 1) + first_codes[remaining]
-        _, first, output_of = np.unique(keys, return_index=True, return_inverse=True)
-        plan = plan._replace(token_of=plan.token_of[first])
+    compared, shares = np.arange(len(remaining)), np.ones(len(remaining), np.float32)
+    if not recipe.losses.render_weight:
+        compared, shares = draw_compared(first_codes[remaining], rng)
+        plan = plan._replace(token_of=plan.token_of[compared])
     return Sample(
         name=f"{scene.name} ({', '.join(source.view_names[view] for view in views)})",
         attributes=attributes,
         opacities=opacities,
         plan=plan,
         teachers=tuple(
-            no_targets(len(first), teacher.channels)
+            no_targets(len(compared), teacher.channels)
             if part is None or part_codes is None
-            else _targets_of(part, part_codes, teacher, recipe.losses, views, selected, remaining, first, output_of)
+            else _targets_of(part, part_codes, teacher, recipe.losses, views, selected, remaining, compared, shares)
             for part, part_codes, teacher in zip(scene.parts, codes, recipe.teachers, strict=True)
         ),
     )
+
+
+MAX_COMPARED = 1024
+"""Largest number of Gaussians of a sample that enter the loss on Gaussians where no view is rendered: those of one
+class and one crop say much the same, and to decode and compare all of them would take a third of a step."""
+
+
+def draw_compared(
+    codes: Int32[np.ndarray, " N"], rng: np.random.Generator
+) -> tuple[Int64[np.ndarray, " m"], Float32[np.ndarray, " m"]]:
+    """Draws at most MAX_COMPARED Gaussians, of each class the same number where there are enough, and the number that
+    each of them stands for, so that no class gains or loses weight."""
+    _, classes, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    drawn, ascending = np.zeros(len(counts), np.int64), np.argsort(counts, kind="stable")
+    left = MAX_COMPARED
+    for position, number in enumerate(ascending):
+        drawn[number] = min(counts[number], max(1, left // (len(counts) - position)))
+        left -= drawn[number]
+    shuffled = rng.permutation(len(codes))
+    by_class = shuffled[np.argsort(classes[shuffled], kind="stable")]
+    rank = np.arange(len(codes)) - np.repeat(np.cumsum(counts) - counts, counts)
+    compared = np.sort(by_class[rank < np.repeat(drawn, counts)])
+    return compared, (counts / drawn)[classes[compared]].astype(np.float32)
 
 
 def rarity_weights(codes: Integer[np.ndarray, " N"], power: float) -> Float32[np.ndarray, " N"]:
@@ -596,19 +617,19 @@ def _targets_of(
     views: Sequence[int],
     selected: Int64[np.ndarray, " s"],
     remaining: Int64[np.ndarray, " n"],
-    first: Int64[np.ndarray, " m"],
-    output_of: Int64[np.ndarray, " n"],
+    compared: Int64[np.ndarray, " m"],
+    shares: Float32[np.ndarray, " m"],
 ) -> TeacherTargets:
-    """The targets of one teacher for the remaining Gaussians, and its rows in the views. Those that have one output and
-    one target enter the loss as the first of them, with the weights of all."""
+    """The targets of one teacher for those of the remaining Gaussians that enter the loss on Gaussians, and its rows in
+    the views."""
     rows = [empty_rows(teacher.channels)]
     for view in views if losses.render_weight and teacher.weight else ():
         view_rows = restrict_rows(scene.view(view), len(scene), selected, remaining, losses)
         rows.append(make_render_rows(view_rows, teacher.codebook, losses.rarity))
-    weights = np.bincount(output_of, rarity_weights(codes[remaining], losses.rarity))
+    weights = rarity_weights(codes[remaining], losses.rarity)[compared] * shares
     return TeacherTargets(
-        targets=torch.from_numpy(scene.float16_targets(remaining[first])),
-        codes=torch.from_numpy(codes[remaining[first]].astype(np.int64)),
-        loss_weights=torch.from_numpy(weights.astype(np.float32)),
+        targets=torch.from_numpy(scene.float16_targets(remaining[compared])),
+        codes=torch.from_numpy(codes[remaining[compared]].astype(np.int64)),
+        loss_weights=torch.from_numpy(weights),
         rows=join_rows(rows, [0] * len(rows)),
     )

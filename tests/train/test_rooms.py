@@ -13,9 +13,9 @@ from training_scenes import SMALL
 from gsencoder.core.errors import InputError
 from gsencoder.data.furnished.kinds import kinds
 from gsencoder.data.furnished.library import load_libraries
-from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.train import samples
 from gsencoder.train.loop import micro_batches
-from gsencoder.train.losses import Distillation, LossConfig, TeacherRecipe
+from gsencoder.train.losses import LossConfig, TeacherRecipe
 from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.train.rooms import RoomStream, models_of
 from gsencoder.train.samples import (
@@ -24,8 +24,6 @@ from gsencoder.train.samples import (
     SampleDataset,
     SampleRecipe,
     SamplingConfig,
-    TrainingScene,
-    join_samples,
     make_sample,
 )
 
@@ -80,24 +78,34 @@ def test_targets_are_the_vectors_of_the_labels(library: Path) -> None:
     assert len(targets.rows.row_weights) == 0
 
 
-def test_gaussians_of_one_class_in_one_token_enter_the_loss_once_for_all(library: Path) -> None:
-    settings = recipe(
-        losses=LossConfig(contrast_weight=1.0, render_weight=0.0), encoder=replace(SMALL, voxel=0.3), augmentation=None
-    )
+def test_few_gaussians_of_each_class_enter_the_loss_with_the_weight_of_all(
+    library: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = recipe(losses=LossConfig(contrast_weight=1.0, render_weight=0.0), augmentation=None)
     scene, codes = stream(library).scene(0)
-    every = TrainingScene([replace(scene.first, labeled=False)])
-    merged, plain = (make_sample(each, codes, settings, 2000, np.random.default_rng(0)) for each in (scene, every))
-    assert len(merged.teachers[0].codes) < len(plain.teachers[0].codes) == len(plain.attributes)
-    torch.manual_seed(0)
-    encoder = GaussianEncoder(settings.encoder, CODEBOOK.shape[1]).eval()
-    results = []
-    for sample in (merged, plain):
-        batch = join_samples([sample, sample], settings.encoder.transformer.patch)
-        loss = Distillation(encoder, settings.losses, settings.teachers)
-        total = sum(value / loss.divisors(batch)[name] for name, value in loss(batch).items())
-        results.append([total, *torch.autograd.grad(total, list(encoder.parameters()))])
-    for ours, theirs in zip(*results, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
+    every = make_sample(scene, codes, settings, 1000, np.random.default_rng(0))
+    assert len(every.teachers[0].codes) == len(every.attributes) > 500
+    monkeypatch.setattr(samples, "MAX_COMPARED", 200)
+    drawn = make_sample(scene, codes, settings, 1000, np.random.default_rng(0))
+    some, whole = drawn.teachers[0], every.teachers[0]
+    assert torch.equal(drawn.attributes, every.attributes)
+    assert len(some.codes) == len(drawn.plan.token_of) == 200
+    for code in whole.codes.unique():
+        ours, theirs = some.loss_weights[some.codes == code], whole.loss_weights[whole.codes == code]
+        torch.testing.assert_close(ours.sum(), theirs.sum())
+        assert len(ours) == len(theirs) or len(ours) >= 200 // len(whole.codes.unique())
+
+
+def test_the_loss_on_drawn_gaussians_is_in_the_mean_the_loss_on_all() -> None:
+    rng = np.random.default_rng(0)
+    codes = np.repeat(np.arange(4, dtype=np.int32), [5, 300, 2000, 4000])
+    losses = rng.random(len(codes))
+    sums = []
+    for _ in range(300):
+        compared, shares = samples.draw_compared(codes, rng)
+        assert len(compared) == samples.MAX_COMPARED
+        sums.append((losses[compared] * shares).sum())
+    assert np.mean(sums) == pytest.approx(losses.sum(), abs=4 * np.std(sums) / 300**0.5)
 
 
 def test_cells_are_drawn_for_each_room_and_seeds_are_as_dense_as_they_ask(library: Path) -> None:
