@@ -11,7 +11,7 @@ import re
 import warnings
 import zipfile
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -211,6 +211,25 @@ def _read_member(file: Path, name: str) -> bytes:
             raise InputError(f"expected a zip archive, got a damaged one ({error})") from error
 
 
+class _Members(Mapping[str, bytes]):
+    """The files of an archive by name, of which those asked for are read."""
+
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self._archive, self._names = archive, dict.fromkeys(archive.namelist())
+
+    def __getitem__(self, name: str) -> bytes:
+        return self._archive.read(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
 def _read_mesh(file: Path, name: str) -> Mesh:
     """Reads an OBJ file of a library with its materials; models of very many faces are simplified.
 
@@ -220,10 +239,7 @@ def _read_mesh(file: Path, name: str) -> Mesh:
 
     with zipfile.ZipFile(file) as archive, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        resolver = trimesh.resolvers.ZipResolver(
-            {entry: io.BytesIO(archive.read(entry)) for entry in archive.namelist() if _is_sibling(entry, name)},
-            namespace=str(Path(name).parent),
-        )
+        resolver = trimesh.resolvers.ZipResolver(_Members(archive), namespace=str(Path(name).parent))
         try:
             scene = trimesh.load(
                 io.BytesIO(_read_member(file, name)), file_type="obj", resolver=resolver, process=False, force="scene"
@@ -266,10 +282,6 @@ def _simplified(mesh: Mesh) -> Mesh:
         )
         cell *= 1.5
     return mesh
-
-
-def _is_sibling(entry: str, name: str) -> bool:
-    return Path(entry).parent == Path(name).parent and not entry.endswith("/")
 
 
 def _uvs(part: Any) -> Float32[np.ndarray, "F 3 2"]:

@@ -45,7 +45,7 @@ _EXTRAS: dict[RoomType, tuple[float, float]] = {
 }
 """Single things on floor, walls and ceiling, in addition to groups."""
 _KITCHEN_ROW = ("kitchen cabinet", "stove", "kitchen cabinet", "kitchen sink", "oven", *(2 * ["kitchen cabinet"]))
-_ON_DESKS = {"monitor": 0.6, "laptop": 0.4, "keyboard": 0.5, "desk lamp": 0.3, "telephone": 0.2}
+_ON_DESKS = {"monitor": 0.6, "laptop": 0.4, "desk lamp": 0.3, "telephone": 0.2}
 """Things on desks, and how often."""
 
 

@@ -1,15 +1,26 @@
 """Furniture libraries: sizes, axes, materials, makes, and what is wrong with a file."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
-from furniture import MODELS, catalogue, write_library
+from furniture import MATERIALS, MODELS, catalogue, write_library
+from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.furnished import library
 from gsencoder.data.furnished.kinds import kind_of, kinds
 from gsencoder.data.furnished.library import Model, held_out_models, load_libraries, select_makes
+
+
+def test_pictures_are_found_in_a_folder_below_the_model(tmp_path: Path) -> None:
+    picture = io.BytesIO()
+    Image.new("RGB", (8, 8), (0, 0, 255)).save(picture, "PNG")
+    materials = MATERIALS.replace("back.png", "maps/back.png").encode()
+    files = {"box/back.png": b"", "box/box.mtl": materials, "box/maps/back.png": picture.getvalue()}
+    mesh = load_libraries([write_library(tmp_path / "below.sh3f", files=files)])[0].mesh
+    assert sum(texture is not None for texture in mesh.textures) == 1
 
 
 def test_a_model_has_the_size_of_the_catalogue_and_stands_on_the_floor(models: tuple[Model, ...]) -> None:
