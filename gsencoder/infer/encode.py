@@ -24,6 +24,7 @@ from gsencoder.core.threads import ahead
 from gsencoder.data.up import scaled, upright_gaussians
 from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
+from gsencoder.infer.segments import average_within, surface_segments
 from gsencoder.models.grid import cut_scene_curves
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, find_weights
 from gsencoder.text.table import TextTable
@@ -64,6 +65,11 @@ class EncodeConfig(CheckedConfig):
     device: Device = option("auto", "where the encoder computes")
     grids: tuple[float, ...] = option(
         (), "edges of token grids, metres, whose outputs are averaged; empty = those of the weights", gt=0, lt=math.inf
+    )
+    segments: bool = option(
+        False,
+        "average the outputs within segments of surface of one direction and color, which names large things better; "
+        "things of few cells take the name of what they stand on",
     )
 
 
@@ -181,6 +187,10 @@ class Encoder:
         if len(grids) > 1:
             for each in values.values():
                 each /= len(grids)
+        if config.segments:
+            segments = surface_segments(gaussians, self.voxel)
+            for each in values.values():
+                average_within(segments, each)
         return {
             teacher: self.outputs[teacher].features(each, self._confidence(teacher, each, gaussians.means))
             for teacher, each in values.items()
