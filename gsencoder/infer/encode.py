@@ -24,7 +24,7 @@ from gsencoder.core.threads import ahead
 from gsencoder.data.up import scaled, upright_gaussians
 from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
-from gsencoder.infer.segments import average_within, surface_segments
+from gsencoder.infer.segments import LAST_CELL, average_within, cell_keys, surface_segments
 from gsencoder.models.grid import cut_scene_curves
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, find_weights
 from gsencoder.text.table import TextTable
@@ -41,8 +41,6 @@ LEAST_REGION = 1_000
 """Gaussians of a region that is encoded by itself; smaller ones are strays, and are encoded together."""
 NAME_ROWS = 16_384
 """Gaussians whose names are compared at a time."""
-LAST_CELL = 2**20
-"""Further cells along an axis count as this one, so that three numbers of cells fit into one integer."""
 TOLERANCE = 1e-4
 """Largest difference of an exported network from torch, as a share of the largest output."""
 COSINE = 0.99
@@ -173,15 +171,12 @@ class Encoder:
         values: dict[str, Float32[np.ndarray, "N _channels"]] = {
             teacher: np.zeros((len(gaussians), part.stop - part.start), np.float32) for teacher, part in columns.items()
         }
-        for number, grid in enumerate(grids):
+        for grid in grids:
             bad = 0
             for rows, features in self._on_grid(gaussians, grid, config, track):
                 bad += int((~np.isfinite(features).all(axis=1)).sum())
                 for teacher, part in columns.items():
-                    if number:
-                        values[teacher][rows] += features[:, part]
-                    else:
-                        values[teacher][rows] = features[:, part]
+                    values[teacher][rows] += features[:, part]
             if bad:
                 raise InputError(f"encode: {bad} of {len(gaussians)} features are not finite; try precision=float32")
         if len(grids) > 1:
@@ -328,11 +323,7 @@ def scene_regions(means: Float32[np.ndarray, "N 3"], voxel: float) -> Int64[np.n
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    keys = np.zeros(len(means), np.int64)
-    for column in means.T:
-        # Borders lie at multiples of the edge in the world, so that a region is the same whatever else there is.
-        cells = np.floor(column.astype(np.float64) / (REGION_CELL * voxel))
-        keys = keys * (LAST_CELL + 1) + np.minimum(cells - cells.min(), LAST_CELL).astype(np.int64)
+    keys = cell_keys(means, REGION_CELL * voxel)
     occupied = np.unique(keys)
     tree = cKDTree(np.stack(np.unravel_index(occupied, (LAST_CELL + 1,) * 3), axis=1))
     pairs = tree.query_pairs(1.5, p=np.inf, output_type="ndarray")

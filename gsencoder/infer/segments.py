@@ -21,8 +21,20 @@ SCALE = 1.0
 """k of the paper: a segment of n cells joins along edges up to k / n heavier than those that it holds."""
 SMALLEST = 10
 """Cells of a segment below which it joins the neighbor that differs least."""
-LAST = (1 << 21) - 1
-"""Largest number of a cell on an axis; Gaussians that lie farther away share the last one."""
+LAST_CELL = 2**20
+"""Further cells along an axis count as this one, so that three numbers of cells fit into one integer."""
+
+
+def cell_keys(means: Float32[np.ndarray, "N 3"], edge: float) -> Int64[np.ndarray, " N"]:
+    """The cell of each Gaussian: its three numbers from the lowest, in base LAST_CELL + 1.
+
+    Borders lie at multiples of the edge in the world, so that a cell is the same whatever else there is.
+    """
+    keys = np.zeros(len(means), np.int64)
+    for column in means.T:
+        cells = np.floor(column.astype(np.float64) / edge)
+        keys = keys * (LAST_CELL + 1) + np.minimum(cells - cells.min(), LAST_CELL).astype(np.int64)
+    return keys
 
 
 def surface_segments(gaussians: Gaussians, cell: float) -> Int64[np.ndarray, " N"]:
@@ -33,19 +45,14 @@ def surface_segments(gaussians: Gaussians, cell: float) -> Int64[np.ndarray, " N
     """
     from scipy.spatial import cKDTree
 
-    keys = np.zeros(len(gaussians), np.int64)
-    for column in gaussians.means.T:
-        cells = np.floor(column.astype(np.float64) / cell)
-        keys = keys * (LAST + 1) + np.minimum(cells - cells.min(), LAST).astype(np.int64)
-    _, cell_of, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    _, cell_of, counts = np.unique(cell_keys(gaussians.means, cell), return_inverse=True, return_counts=True)
     if len(counts) == 1:
         return np.zeros(len(gaussians), np.int64)
     centers, colors = (
         np.stack([np.bincount(cell_of, column) for column in values.T], axis=1) / counts[:, None]
         for values in (gaussians.means, SH_C0 * gaussians.sh[:, 0])
     )
-    tree = cKDTree(centers)
-    _, near = tree.query(centers, k=min(NEIGHBORS + 1, len(centers)))
+    _, near = cKDTree(centers).query(centers, k=min(NEIGHBORS + 1, len(centers)))
     normals = _normals(centers[near])
     first, second = np.repeat(np.arange(len(centers)), near.shape[1] - 1), near[:, 1:].reshape(-1)
     apart = np.linalg.norm(centers[first] - centers[second], axis=1)
@@ -54,7 +61,7 @@ def surface_segments(gaussians: Gaussians, cell: float) -> Int64[np.ndarray, " N
     weights = 1 - np.abs((normals[first] * normals[second]).sum(axis=1))
     weights += COLOR * np.abs(colors[first] - colors[second]).sum(axis=1)
     order = np.argsort(weights, kind="stable")
-    roots = _join(first[order], second[order], weights[order], len(centers), SCALE, SMALLEST)
+    roots = _join(first[order], second[order], weights[order], len(centers))
     return np.unique(roots, return_inverse=True)[1][cell_of]
 
 
@@ -82,16 +89,16 @@ def _find(parents, node):
 
 @kernel
 @no_type_check
-def _join(first, second, weights, nodes, scale, smallest):
+def _join(first, second, weights, nodes):
     """The root of each node's segment; edges come in ascending order."""
-    parents, sizes, limits = np.arange(nodes), np.ones(nodes, np.int64), np.full(nodes, scale)
+    parents, sizes, limits = np.arange(nodes), np.ones(nodes, np.int64), np.full(nodes, SCALE)
     for small_only in (False, True):
         for edge in range(len(first)):
             one, other = _find(parents, first[edge]), _find(parents, second[edge])
             if one == other:
                 continue
             if small_only:
-                joins = min(sizes[one], sizes[other]) < smallest
+                joins = min(sizes[one], sizes[other]) < SMALLEST
             else:
                 joins = weights[edge] <= min(limits[one], limits[other])
             if joins:
@@ -99,7 +106,7 @@ def _join(first, second, weights, nodes, scale, smallest):
                     one, other = other, one
                 parents[other] = one
                 sizes[one] += sizes[other]
-                limits[one] = weights[edge] + scale / sizes[one]
+                limits[one] = weights[edge] + SCALE / sizes[one]
     for node in range(nodes):
         parents[node] = _find(parents, node)
     return parents
