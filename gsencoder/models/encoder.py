@@ -257,7 +257,15 @@ def load_start(config: EncoderConfig, source: str | Path) -> tuple[GaussianEncod
     """Reads weights to start from, and checks that they are of a network with these settings."""
     trained, spaces, _ = load_weights(source, "init")
     theirs, ours = (
-        asdict(replace(each, coarser=(), transformer=replace(each.transformer, drop_path=0.0)))
+        asdict(
+            replace(
+                each,
+                # A network that knows the size of its cells may start on others.
+                voxel=1.0 if "cell" in each.inputs else each.voxel,
+                coarser=(),
+                transformer=replace(each.transformer, drop_path=0.0),
+            )
+        )
         for each in (trained.config, config)
     )
     if theirs != ours:

@@ -202,3 +202,13 @@ def test_an_encoder_does_not_start_from_weights_of_another_network(tmp_path: Pat
     other = GaussianEncoder(replace(SMALL, voxel=0.05), outputs(False).widths)
     with pytest.raises(InputError, match=r"made with model.voxel=0.1, and this run asks model.voxel=0.05; give the"):
         start_from(other, outputs(False), tmp_path / "e.safetensors")
+
+
+def test_an_encoder_that_knows_the_size_of_its_cells_starts_on_others(tmp_path: Path) -> None:
+    config = replace(SMALL, inputs=("color", "cell"))
+    trained = GaussianEncoder(config, outputs(False).widths)
+    save_weights(tmp_path / "e.safetensors", trained, outputs(False), {})
+    started = GaussianEncoder(replace(config, voxel=0.05), outputs(False).widths)
+    start_from(started, outputs(False), tmp_path / "e.safetensors")
+    for name, value in trained.state_dict().items():
+        torch.testing.assert_close(started.state_dict()[name], value)

@@ -170,6 +170,7 @@ class MakeRanges(NamedTuple):
         cells: what cells hold, each as often as it stands here.
         back, arms: height above the body, and thickness; None = without.
         finish: of the body, each as often as it stands here.
+        hung: share of them that hangs on a wall.
     """
 
     width: Span
@@ -184,6 +185,7 @@ class MakeRanges(NamedTuple):
     back: tuple[Span, Span] | None
     arms: tuple[Span, Span] | None
     finish: tuple[str, ...]
+    hung: float
 
 
 @cache
@@ -192,10 +194,10 @@ def makes() -> Mapping[str, MakeRanges]:
     by_kind = {}
     for row in table_rows("makes.csv"):
         kind, lists = row.pop("kind"), {key: listed_cell(row.pop(key)) for key in ("cells", "finish")}
-        legs, pairs = row.pop("legs"), {key: row.pop(key) for key in ("back", "arms")}
+        legs, hung, pairs = row.pop("legs"), float(row.pop("hung")), {key: row.pop(key) for key in ("back", "arms")}
         ranges = {key: _range(cell) for key, cell in row.items()}
         parts = {key: tuple(map(_range, cell.split())) or None for key, cell in pairs.items()}
-        by_kind[kind] = MakeRanges(legs=legs, **lists, **ranges, **parts)  # type: ignore[arg-type]
+        by_kind[kind] = MakeRanges(legs=legs, hung=hung, **lists, **ranges, **parts)  # type: ignore[arg-type]
     return by_kind
 
 
@@ -335,7 +337,7 @@ def made_model(kind: str, rng: np.random.Generator) -> MadeModel:
     blocks = _Blocks(make, rng)
     width, depth, height, foot = (float(rng.uniform(*each)) for each in make[:4])
     foot = min(foot, height - _BOARD) * (rng.random() < 0.6 or make.legs != "legs")
-    hung = kind == "kitchen cabinet" and rng.random() < 0.4
+    hung = bool(make.hung) and rng.random() < make.hung
     x, y, is_opening = (-width / 2, width / 2), (-depth / 2, depth / 2), make.cells[0] in ("leaf", "pane")
     is_block = make.cells[0] in ("plain", "rib")
     zs = blocks.edges((foot, height), make.cell_height)

@@ -216,7 +216,9 @@ def _voxel_keys(points: Float32[np.ndarray, "n 3"], voxel: float) -> Int64[np.nd
 def _commonest(keys: Int64[np.ndarray, " n"], count: int, voxels: Int64[np.ndarray, " m"]) -> Int32[np.ndarray, " m"]:
     """The commonest item in each of some voxels, given voxel · count + item of all pixels."""
     pairs, pixels = np.unique(keys, return_counts=True)
-    order = np.lexsort((-pixels, pairs // count))
-    sorted_voxels, first = np.unique(pairs[order] // count, return_index=True)
-    rows = np.searchsorted(sorted_voxels, voxels).clip(max=len(first) - 1)
-    return (pairs[order][first][rows] % count).astype(np.int32)
+    voxel_of, item_of = np.divmod(pairs, count)
+    first = np.flatnonzero(np.diff(voxel_of, prepend=-1))
+    # Of equally common items the one with the smallest number.
+    best = np.maximum.reduceat(pixels * count + count - 1 - item_of, first)
+    rows = np.searchsorted(voxel_of[first], voxels).clip(max=len(first) - 1)
+    return (count - 1 - best[rows] % count).astype(np.int32)
