@@ -1,11 +1,11 @@
-"""Shapes that no library has: walls with openings, floors, slabs and curtains, and makes of our own of furniture, doors
-and windows, with texture coordinates in metres."""
+"""Shapes that no library has, with texture coordinates in metres: walls with openings, floors, slabs and curtains, and
+makes of our own of furniture, doors, windows, lamps and vessels."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -87,10 +87,11 @@ def curtain(width: float, height: float, folds: int) -> Mesh:
     return _sheet(np.stack(rows, axis=1))
 
 
-def _sheet(grid: Float64[np.ndarray, "n m 3"]) -> Mesh:
-    """The quads between the points of a grid."""
+def _sheet(grid: Float64[np.ndarray, "n m 3"], materials: Sequence[int] = ()) -> Mesh:
+    """The quads between the points of a grid, whose rows may have a material each."""
     corners = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2)
-    return mesh_of_quads(list(corners.reshape(-1, 4, 3)))
+    of_quads = np.repeat(np.array(materials, np.int32), len(grid[0]) - 1)
+    return mesh_of_quads(list(corners.reshape(-1, 4, 3)), of_quads.tolist())
 
 
 def panels(
@@ -158,10 +159,22 @@ def _reveal(
 
 Span = tuple[float, float]
 """Lower and upper bound."""
+SIDES, RINGS = 24, 9
+"""Sides of a turned shape, and levels at which its profile is sampled at least."""
+_TIP = 0.005
+"""Radius of a turned shape on its axis, as a share of its largest."""
 
 
-class MakeRanges(NamedTuple):
-    """How things of a kind vary: a body above feet, whose front is divided into cells, and on it a cushion, a back and
+class Built(NamedTuple):
+    """A shape that was made: what things stand on is at the height `top`, None = nowhere."""
+
+    mesh: Mesh
+    finishes: tuple[str, ...]
+    top: float | None
+
+
+class BlockRanges(NamedTuple):
+    """How things of blocks vary: a body above feet, whose front is divided into cells, and on it a cushion, a back and
     arms. Lengths are metres, each between two bounds.
 
     Attributes:
@@ -170,7 +183,7 @@ class MakeRanges(NamedTuple):
         cells: what cells hold, each as often as it stands here.
         back, arms: height above the body, and thickness; None = without.
         finish: of the body, each as often as it stands here.
-        hung: share of them that hangs on a wall.
+        hung, elevation: share of them that hangs on a wall, and how high above the floor.
     """
 
     width: Span
@@ -186,24 +199,126 @@ class MakeRanges(NamedTuple):
     arms: tuple[Span, Span] | None
     finish: tuple[str, ...]
     hung: float
+    elevation: Span
+
+    def build(self, rng: np.random.Generator) -> Built:
+        blocks = _Blocks(self, rng)
+        width, depth, height, foot = (float(rng.uniform(*each)) for each in self[:4])
+        foot = min(foot, height - _BOARD) * (rng.random() < 0.6 or self.legs != "legs")
+        x, y, is_opening = (-width / 2, width / 2), (-depth / 2, depth / 2), self.cells[0] in ("leaf", "pane")
+        is_block = self.cells[0] in ("plain", "rib")
+        zs = blocks.edges((foot, height), self.cell_height)
+        bar = float(rng.uniform(0.03, 0.09) if is_opening else rng.uniform(0.015, 0.04))
+        for number, column in enumerate(pairwise(blocks.edges(x, self.cell_width))):
+            if number and not is_opening and rng.random() < 0.3:
+                zs = blocks.edges((foot, height), self.cell_height)
+            if not is_block:
+                blocks.lattice(np.array(column), y, zs, bar, _BODY)
+            for row in pairwise(zs):
+                blocks.fill(str(rng.choice(self.cells)), column, row, depth)
+        if not is_opening and not is_block and rng.random() < 0.9:
+            blocks.add(x, (depth / 2 - 0.01, depth / 2), (foot, height), _BODY)
+        if foot:
+            blocks.legs(self.legs, width, depth, foot)
+        cushion = float(rng.uniform(*self.cushion))
+        if cushion:
+            blocks.add((x[0] + 0.02, x[1] - 0.02), (y[0] + 0.01, y[1]), (height, height + cushion), _CLOTH)
+        if self.back:
+            rise, thick = (float(rng.uniform(*each)) for each in self.back)
+            blocks.add(x, (y[1] - thick, y[1]), (foot, height + rise), _BODY)
+        if self.arms and rng.random() < 0.8:
+            rise, thick = (float(rng.uniform(*each)) for each in self.arms)
+            for side in ((x[0], x[0] + thick), (x[1] - thick, x[1])):
+                blocks.add(side, y, (foot, height + rise), _BODY)
+        return Built(blocks.mesh(), blocks.finishes, height + cushion)
+
+
+class TurnedRanges(NamedTuple):
+    """How things with a profile around an upright axis vary, such as bowls, lamps and bathtubs.
+
+    Attributes:
+        depth: as a share of the width.
+        profile: height and radius of its corners, as shares of the height and of half the width; a last radius of
+            exactly 1 is a table on which things stand.
+        hollow: share of them that is open above.
+        corner: exponent of the superellipse that a level is: 2 is an ellipse, 12 nearly a rectangle.
+        finish, hung, elevation: see `BlockRanges`.
+    """
+
+    width: Span
+    depth: Span
+    height: Span
+    profile: tuple[tuple[float, Span], ...]
+    hollow: float
+    corner: Span
+    finish: tuple[str, ...]
+    hung: float
+    elevation: Span
+
+    def build(self, rng: np.random.Generator) -> Built:
+        from scipy.interpolate import PchipInterpolator
+
+        width, height = float(rng.uniform(*self.width)), float(rng.uniform(*self.height))
+        half = np.array([width, width * rng.uniform(*self.depth)]) / 2
+        corners = np.array([level for level, _ in self.profile])
+        radii = np.array([rng.uniform(*span) for _, span in self.profile])
+        gaps = np.diff(corners)
+        corners[1:-1] += rng.uniform(-0.25, 0.25, len(gaps) - 1) * np.minimum(gaps[:-1], gaps[1:])
+        levels = np.union1d(corners, np.linspace(0, 1, RINGS))
+        is_smooth = rng.random() < 0.5
+        outside = PchipInterpolator(corners, radii)(levels) if is_smooth else np.interp(levels, corners, radii)
+        rings = [(0.0, _TIP), *zip(levels, outside, strict=True)]
+        is_hollow = rng.random() < self.hollow
+        if is_hollow:
+            wall = float(rng.uniform(0.04, 0.12))
+            inside = np.maximum(outside - wall, 0.3 * outside)[:0:-1]
+            rings += [*zip(levels[:0:-1], inside, strict=True), (levels[1], _TIP)]
+        else:
+            rings.append((1.0, _TIP))
+        split = int(rng.integers(1, len(rings))) if rng.random() < 0.5 else len(rings)
+        angles = np.linspace(0, 2 * np.pi, SIDES + 1)
+        circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        exponent = rng.uniform(*self.corner)
+        circle /= (np.abs(circle) ** exponent).sum(axis=1, keepdims=True) ** (1 / exponent)
+        grid = np.array([[(*radius * half * each, height * level) for each in circle] for level, radius in rings])
+        mesh = _sheet(grid, [_BODY if number < split else _FRONT for number in range(len(rings) - 1)])
+        is_table = not is_hollow and radii[-1] == 1
+        return Built(mesh, tuple(rng.choice(self.finish, 2).tolist()), height if is_table else None)
 
 
 @cache
-def makes() -> Mapping[str, MakeRanges]:
-    """The kinds of which `made_model` makes models."""
-    by_kind = {}
-    for row in table_rows("makes.csv"):
-        kind, lists = row.pop("kind"), {key: listed_cell(row.pop(key)) for key in ("cells", "finish")}
-        legs, hung, pairs = row.pop("legs"), float(row.pop("hung")), {key: row.pop(key) for key in ("back", "arms")}
-        ranges = {key: _range(cell) for key, cell in row.items()}
-        parts = {key: tuple(map(_range, cell.split())) or None for key, cell in pairs.items()}
-        by_kind[kind] = MakeRanges(legs=legs, hung=hung, **lists, **ranges, **parts)  # type: ignore[arg-type]
+def makes() -> Mapping[str, Sequence[BlockRanges | TurnedRanges]]:
+    """The kinds of which `made_model` makes models, and how these vary."""
+    cells: dict[str, Callable[[str], Any]] = {
+        "legs": str,
+        "cells": listed_cell,
+        "back": _ranges,
+        "arms": _ranges,
+        "profile": _profile,
+        "finish": listed_cell,
+        "hollow": float,
+        "hung": float,
+    }
+    by_kind: dict[str, list[BlockRanges | TurnedRanges]] = {}
+    for table, ranges in (("makes.csv", BlockRanges), ("turned.csv", TurnedRanges)):
+        for row in table_rows(table):
+            values = {key: cells.get(key, _range)(cell) for key, cell in row.items() if key != "kind"}
+            by_kind.setdefault(row["kind"], []).append(ranges(**values))
     return by_kind
 
 
 def _range(cell: str) -> Span:
     lower, upper = cell.split("-")
     return float(lower), float(upper)
+
+
+def _ranges(cell: str) -> tuple[Span, ...] | None:
+    return tuple(map(_range, cell.split())) or None
+
+
+def _profile(cell: str) -> tuple[tuple[float, Span], ...]:
+    corners = [corner.split(":") for corner in cell.split()]
+    return tuple((float(level), _range(radius)) for level, radius in corners)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +344,7 @@ _BODY, _FRONT, _HANDLE, _CLOTH, _CONTENTS = 0, 1, 2, 3, (4, 5, 6, 7)
 class _Blocks:
     """Blocks of which a thing is built, each with its material."""
 
-    def __init__(self, make: MakeRanges, rng: np.random.Generator) -> None:
+    def __init__(self, make: BlockRanges, rng: np.random.Generator) -> None:
         self.rng, self.corners, self.materials = rng, [], []  # type: ignore[var-annotated]
         handle = rng.choice(["paint", "wood", "metal"], p=[0.2, 0.2, 0.6])
         self.finishes = (*rng.choice(make.finish, 2).tolist(), str(handle), *(5 * ["fabric"]))
@@ -263,6 +378,9 @@ class _Blocks:
 
     def fill(self, cell: str, x: Span, z: Span, depth: float) -> None:
         """Fills a cell of the front, which is at y = −depth / 2."""
+        if cell == "glass":
+            front = -depth / 2 - self.overlay
+            self.lattice(np.array(x), (front, front + 0.02), np.array(z), 0.05, self.front)
         if cell in ("door", "drawer"):
             self._closed(cell == "drawer", x, z, -depth / 2 - self.overlay)
         elif cell in ("leaf", "pane"):
@@ -333,46 +451,18 @@ class _Blocks:
 
 def made_model(kind: str, rng: np.random.Generator) -> MadeModel:
     """Makes a model of one of the kinds that `makes` has, unlike any other."""
-    make = makes()[kind]
-    blocks = _Blocks(make, rng)
-    width, depth, height, foot = (float(rng.uniform(*each)) for each in make[:4])
-    foot = min(foot, height - _BOARD) * (rng.random() < 0.6 or make.legs != "legs")
-    hung = bool(make.hung) and rng.random() < make.hung
-    x, y, is_opening = (-width / 2, width / 2), (-depth / 2, depth / 2), make.cells[0] in ("leaf", "pane")
-    is_block = make.cells[0] in ("plain", "rib")
-    zs = blocks.edges((foot, height), make.cell_height)
-    bar = float(rng.uniform(0.03, 0.09) if is_opening else rng.uniform(0.015, 0.04))
-    for number, column in enumerate(pairwise(blocks.edges(x, make.cell_width))):
-        if number and not is_opening and rng.random() < 0.3:
-            zs = blocks.edges((foot, height), make.cell_height)
-        if not is_block:
-            blocks.lattice(np.array(column), y, zs, bar, _BODY)
-        for row in pairwise(zs):
-            blocks.fill(str(rng.choice(make.cells)), column, row, depth)
-    if not is_opening and not is_block and rng.random() < 0.9:
-        blocks.add(x, (depth / 2 - 0.01, depth / 2), (foot, height), _BODY)
-    if foot:
-        blocks.legs(make.legs, width, depth, foot)
-    cushion = float(rng.uniform(*make.cushion))
-    if cushion:
-        blocks.add((x[0] + 0.02, x[1] - 0.02), (y[0] + 0.01, y[1]), (height, height + cushion), _CLOTH)
-    if make.back:
-        rise, thick = (float(rng.uniform(*each)) for each in make.back)
-        blocks.add(x, (y[1] - thick, y[1]), (foot, height + rise), _BODY)
-    if make.arms and rng.random() < 0.8:
-        rise, thick = (float(rng.uniform(*each)) for each in make.arms)
-        for side in ((x[0], x[0] + thick), (x[1] - thick, x[1])):
-            blocks.add(side, y, (foot, height + rise), _BODY)
-    mesh = blocks.mesh()
-    lower, upper = mesh.extent
+    listed = makes()[kind]
+    ranges = listed[int(rng.integers(len(listed)))]
+    built = ranges.build(rng)
+    lower, upper = built.mesh.extent
     middle = np.array([*(lower + upper)[:2] / 2, lower[2]])
     return MadeModel(
         id=f"made {kind}",
         name=kind,
         kind=kinds()[kind],
         size=tuple((upper - lower).tolist()),
-        elevation=float(rng.uniform(1.3, 1.5)) if hung else 0.0,
-        top=height + cushion,
-        made=mesh._replace(vertices=(mesh.vertices - middle).astype(np.float32)),
-        finishes=blocks.finishes,
+        elevation=float(rng.uniform(*ranges.elevation)) if rng.random() < ranges.hung else 0.0,
+        top=built.top,
+        made=built.mesh._replace(vertices=(built.mesh.vertices - middle).astype(np.float32)),
+        finishes=built.finishes,
     )
