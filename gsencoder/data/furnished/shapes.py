@@ -87,11 +87,14 @@ def curtain(width: float, height: float, folds: int) -> Mesh:
     return _sheet(np.stack(rows, axis=1))
 
 
-def _sheet(grid: Float64[np.ndarray, "n m 3"], materials: Sequence[int] = ()) -> Mesh:
-    """The quads between the points of a grid, whose rows may have a material each."""
+def _sheet(grid: Float64[np.ndarray, "n m 3"]) -> Mesh:
+    return mesh_of_quads(_quads_between(grid))
+
+
+def _quads_between(grid: Float64[np.ndarray, "n m 3"]) -> list[Quad]:
+    """The quads between the points of a grid, row by row."""
     corners = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2)
-    of_quads = np.repeat(np.array(materials, np.int32), len(grid[0]) - 1)
-    return mesh_of_quads(list(corners.reshape(-1, 4, 3)), of_quads.tolist())
+    return list(corners.reshape(-1, 4, 3))
 
 
 def panels(
@@ -242,7 +245,7 @@ class TurnedRanges(NamedTuple):
             exactly 1 is a table on which things stand.
         hollow: share of them that is open above.
         corner: exponent of the superellipse that a level is: 2 is an ellipse, 12 nearly a rectangle.
-        finish, hung, elevation: see `BlockRanges`.
+        back, finish, hung, elevation: see `BlockRanges`.
     """
 
     width: Span
@@ -251,6 +254,7 @@ class TurnedRanges(NamedTuple):
     profile: tuple[tuple[float, Span], ...]
     hollow: float
     corner: Span
+    back: tuple[Span, Span] | None
     finish: tuple[str, ...]
     hung: float
     elevation: Span
@@ -281,9 +285,17 @@ class TurnedRanges(NamedTuple):
         exponent = rng.uniform(*self.corner)
         circle /= (np.abs(circle) ** exponent).sum(axis=1, keepdims=True) ** (1 / exponent)
         grid = np.array([[(*radius * half * each, height * level) for each in circle] for level, radius in rings])
-        mesh = _sheet(grid, [_BODY if number < split else _FRONT for number in range(len(rings) - 1)])
+        quads = _quads_between(grid)
+        materials = [_BODY if number < split * SIDES else _FRONT for number in range(len(quads))]
+        if self.back:
+            rise, thick = (float(rng.uniform(*each)) for each in self.back)
+            share, lower = rng.uniform([0.6, 0.7], [1.0, 1.0])
+            lowest = (-share * half[0], half[1] - thick, lower * height)
+            quads += _block(np.array(lowest), np.array([share * half[0], half[1], height + rise]))
+            materials += 6 * [_BODY if rng.random() < 0.5 else _FRONT]
+        finishes = tuple(rng.choice(self.finish, 2).tolist())
         is_table = not is_hollow and radii[-1] == 1
-        return Built(mesh, tuple(rng.choice(self.finish, 2).tolist()), height if is_table else None)
+        return Built(mesh_of_quads(quads, materials), finishes, height if is_table else None)
 
 
 @cache
@@ -335,6 +347,12 @@ class MadeModel(Model):
 _SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
 _CUBE = np.stack([np.insert(_SQUARE, axis, side, axis=1) for axis in range(3) for side in (0.0, 1.0)])
 """The six quads of a block between 0 and 1."""
+
+
+def _block(lower: Float64[np.ndarray, "3"], upper: Float64[np.ndarray, "3"]) -> list[Quad]:
+    return list(lower + _CUBE * (upper - lower))
+
+
 _BOARD = 0.015
 """Least thickness of the top of a table, metres."""
 _BODY, _FRONT, _HANDLE, _CLOTH, _CONTENTS = 0, 1, 2, 3, (4, 5, 6, 7)
@@ -444,9 +462,8 @@ class _Blocks:
                 self.add((at, at + thick), (-y, y), z, _BODY)
 
     def mesh(self) -> Mesh:
-        lower, upper = np.swapaxes(np.array(self.corners), 0, 1)[:, :, None, None]
-        quads = (lower + _CUBE * (upper - lower)).reshape(-1, 4, 3)
-        return mesh_of_quads(list(quads), np.repeat(self.materials, 6).tolist())
+        quads = [quad for lower, upper in self.corners for quad in _block(np.array(lower), np.array(upper))]
+        return mesh_of_quads(quads, np.repeat(self.materials, 6).tolist())
 
 
 def made_model(kind: str, rng: np.random.Generator) -> MadeModel:
