@@ -1,4 +1,4 @@
-"""What an encoder costs: time and memory by size, beside its matrix products alone, and its plan.
+"""What an encoder costs: time and memory by size, against its matrix products alone, and its plan.
 
     python bench/encoder.py [--model tiny|small|base] [--sizes 10000,100000] [--precision float32|bfloat16]
     python bench/encoder.py --chunked 1000000 [--chunk 250000]

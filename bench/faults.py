@@ -109,7 +109,7 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
 
 
 def run_to_its_end(words: list[str], out: Path, kills: int, seconds: float, rng: random.Random) -> int:
-    """Kills a run so many times, and then lets it end; how many of the kills met a run that was still at work."""
+    """Kills a run N times, and then lets it end; how many of the kills met a run that was still at work."""
     done = 0
     command = [sys.executable, "-m", "gsencoder", *words, f"out={out}", "quiet=true"]
     while done < kills:
@@ -164,7 +164,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*")
     parser.add_argument("--faults", nargs="*", default=list(FAULTS), choices=list(FAULTS))
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--every", type=int, default=1, help="take every so many-th call")
+    parser.add_argument("--every", type=int, default=1, help="take every N-th call")
     parser.add_argument("--over", action="store_true", help="kill runs that replace earlier results as well")
     parser.add_argument("--kills", type=int, default=0, help="kills at random moments, in place of all this")
     parser.add_argument("--scene", type=Path, help="what commands that are killed at random read")

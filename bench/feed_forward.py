@@ -1,4 +1,4 @@
-"""Memories of unseen rooms in one pass, beside dense features of the same encoder and beside fused ones.
+"""Memories of unseen rooms in one pass, against dense features of the same encoder and fused ones.
 
     python bench/feed_forward.py ROOM … [--weights house_cpu] [--bank-rooms ROOM …]
 

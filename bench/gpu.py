@@ -1,9 +1,9 @@
-"""What a GPU gives beside the CPU, in one command: parity of every path on CUDA, and what it costs.
+"""What a GPU gives compared with the CPU, in one command: parity of every path on CUDA, and what it costs.
 
     python bench/gpu.py [--out gpu.md] [--small] [--device auto|cpu|cuda] [--radio FOLDER] [--parts blend,onnx]
 
 Parts run one after the other; one that fails is reported with its error, and the others go on. The report is Markdown
-for docs/results/gpu.md, with a JSON file beside it. The exit code is 1 if a part failed. `--small` takes sizes for a
+for docs/results/gpu.md, with a JSON file next to it. The exit code is 1 if a part failed. `--small` takes sizes for a
 CPU.
 """
 

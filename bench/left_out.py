@@ -1,4 +1,4 @@
-"""How well features explain photographs that they were not made from, beside what the teacher says of these.
+"""How well features explain photographs that they were not made from, against what the teacher says of these.
 
     python bench/left_out.py write SCENE OUT [--splat FILE] [--every 8]
     python bench/left_out.py score OUT [--teacher dinov2_s14] [--weights ENCODER …]

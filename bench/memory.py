@@ -1,4 +1,4 @@
-"""Memories beside decoders (M3 tables 1, 3 and 4), in photographs that no memory was made from.
+"""Memories against decoders (M3 tables 1, 3 and 4), in photographs that no memory was made from.
 
     python bench/left_out.py write SCENE OUT
     python bench/memory.py OUT [--teachers dinov2_s14 "mosaic text=minilm"] [--work FOLDER] [--only decoders widths …]

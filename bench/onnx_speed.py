@@ -1,4 +1,4 @@
-"""An exported encoder under onnxruntime beside the same under torch: seconds, memory, and how soon the first answer.
+"""An exported encoder under onnxruntime against the same under torch: seconds, memory, and how soon the first answer.
 
     python bench/onnx_speed.py MODEL.onnx SCENE [--weights house_cpu] [--sizes 20000,100000]
 

@@ -1,4 +1,4 @@
-"""Packed features beside the fused ones: bytes, error, and what boxes are found with each.
+"""Packed features against the fused ones: bytes, error, and what boxes are found with each.
 
 python bench/packages.py SCENE … [--budgets 0.003,0.01,0.03,0.1]
 """

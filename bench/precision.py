@@ -1,4 +1,4 @@
-"""Exports of one encoder in several precisions: bytes, features and seconds beside the first of them.
+"""Exports of one encoder in several precisions: bytes, features and seconds against the first of them.
 
     python bench/precision.py FLOAT32.onnx OTHER.onnx … --scenes SCENE …
 

@@ -126,7 +126,7 @@ def main() -> None:
     parser.add_argument("--space", help="of an encoder with several teachers, the one whose words are asked")
     parser.add_argument("--text", help="folder of a text tower, in whose space labels are fused")
     parser.add_argument("--rooms", default="*")
-    parser.add_argument("--every", type=positive, default=1, help="take one in so many of the rooms")
+    parser.add_argument("--every", type=positive, default=1, help="take one in N of the rooms")
     arguments = parser.parse_args()
     if arguments.space and not arguments.weights:
         parser.error("--space: is of an encoder; give --weights too, or leave it out")
@@ -150,7 +150,7 @@ def main() -> None:
         if space not in encoder.tables:
             option = f"--space {arguments.space}" if arguments.space else f"--weights {arguments.weights}"
             parser.error(
-                f"{option}: no such words beside the encoder; it has those of: {listed(list(encoder.tables)) or 'none'}"
+                f"{option}: no such words with the encoder; it has those of: {listed(list(encoder.tables)) or 'none'}"
             )
         words: Words | None = words_of_table(encoder.tables[space])
         source = encoder_source(encoder, space=arguments.space)

@@ -3,7 +3,7 @@
     python bench/rasterize.py SCENE [--view 3] [--sparse 9]
 
 Forward, backward and forward again alternate; every figure is a median, the reference's a single run. The reference
-takes minutes with all Gaussians of a scene, so both are compared on every so many-th of them.
+takes minutes with all Gaussians of a scene, so both are compared on every N-th of them.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
     parser.add_argument("--view", type=int, default=3)
-    parser.add_argument("--sparse", type=int, default=9, help="the reference is compared on every so many-th Gaussian")
+    parser.add_argument("--sparse", type=int, default=9, help="the reference is compared on every N-th Gaussian")
     add_json_option(parser)
     options = parser.parse_args()
     scene = load_scene(options.scene)

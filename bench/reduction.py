@@ -1,4 +1,4 @@
-"""Reductions of raw features to principal scene components, beside a transcription of M3's Algorithm 1.
+"""Reductions of raw features to principal scene components, against a transcription of M3's Algorithm 1.
 
     python bench/reduction.py SCENE [--rows 100000] [--thresholds 0.8 0.9] [--teacher teacher=dinov2_s14]
         [--maps FOLDER] [--repeats 2]

@@ -37,7 +37,7 @@ REGISTRY = Path(__file__).with_name("figures.yaml")
 REPEATABLE = ("accuracy", "error", "count", "bytes", "memory")
 """Kinds of figures that do not depend on the load of the machine."""
 NEEDS = {"java": "java", "chromium": "chromium", "compiler": "gcc", "gpu": "nvidia-smi"}
-"""Programs that an entry may need, beside `shared`, the folder of shared data."""
+"""Programs that an entry may need, besides `shared`, the folder of shared data."""
 PATIENCE = 5
 """A command may take this multiple of its minutes."""
 

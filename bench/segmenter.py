@@ -4,7 +4,7 @@
 
 Every eighth frame is left out of the fusion (teacher=mosaic text=minilm). The fused features, rendered there, are named
 by their nearest class and compared with the network's own map of the photograph; both are compared with the red fronts
-of the cabinets, told by color.
+of the cabinets, recognized by color.
 """
 
 import argparse

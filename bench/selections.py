@@ -1,4 +1,4 @@
-"""Selected Gaussians beside the true ones of labeled rooms, and what is left of an object that was taken out.
+"""Selected Gaussians against the true ones of labeled rooms, and what is left of an object that was taken out.
 
     python bench/selections.py ROOM … [--weights house_cpu] [--every 4] [--alone]
     python bench/selections.py ROOM … --boxes [--splats FOLDER]

@@ -1,4 +1,4 @@
-"""A splat alone by a segmenter's words, beside the same splat with photographs.
+"""A splat alone by a segmenter's words, against the same splat with photographs.
 
     python bench/splat_by_words.py $S/scenes/kitchen [--splat splat.ply] [--orbits 24] [--up 0,0,1]
                                                         [--sheet pictures.png]

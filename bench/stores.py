@@ -1,4 +1,4 @@
-"""Every way to store a scene's features: bytes beside the centered cosine and the boxes that are found with it.
+"""Every way to store a scene's features: bytes against the centered cosine and the boxes that are found with it.
 
     python bench/stores.py SCENE … [--teacher teacher=labels] [--plot stores.png] [--optimize]
 

@@ -31,7 +31,7 @@ def main(folder: str, word: str) -> None:
         size = " × ".join(f"{side:.2f}" for side in box.aabb_max - box.aabb_min)
         print(f"{word} at {box.center.round(2)}, {size} m, score {box.score:.2f}, {len(box.rows)} Gaussians")
 
-    # A view beside the word's relevancy, which is rendered as a color is. Gaussians that were never seen have none.
+    # A view next to the word's relevancy, which is rendered as a color is. Gaussians that were never seen have none.
     relevancy = torch.as_tensor(np.nan_to_num(localization.relevancy[0])).clamp(min=0)
     b = blend(scene.gaussians, scene.views.cameras, 0)
     heat = (255 * b.render(relevancy[:, None])).byte().reshape(*b.shape, 1).expand(-1, -1, 3).numpy()

@@ -24,7 +24,7 @@ def main(folder: str, words: str) -> None:
     features = encoder.encode(scene.gaussians, metres_per_unit=scene.metres_per_unit or 1.0, up=scene.up)
     print(f"{len(features):,} features of {features.space.describe()}")
 
-    # It knows the names that it was trained on; the words lie beside the weights.
+    # It knows the names that it was trained on; the words lie next to the weights.
     scene = replace(scene, features={features.space.name: features})
     localization = localize(scene, words.split(","), encoder.words)
     for word in localization.queries:

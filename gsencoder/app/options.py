@@ -389,7 +389,7 @@ class Choices:
 
 
 def conf_folder() -> Path:
-    """The folder of YAML files: inside an installed package, beside it in a source tree."""
+    """The folder of YAML files: inside an installed package, next to it in a source tree."""
     package = Path(__file__).resolve().parents[1]
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 

@@ -264,7 +264,7 @@ class Run:
 
     @contextmanager
     def file(self, out: Path) -> Iterator[None]:
-        """Lets the block write the one file of the results, and writes this record beside it; see `output_file`."""
+        """Lets the block write the one file of the results, and writes this record next to it; see `output_file`."""
         with output_file(out, overwrite=self.config.overwrite, record=self.to_dict):
             yield
 

@@ -94,7 +94,7 @@ def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextCon
     path = table_path(folder, space.text_encoder)
     if path is None:
         raise InputError(
-            f"{folder}: there is no {WORDS_FILE} beside these features: their teacher has no words, or the file was "
+            f"{folder}: there is no {WORDS_FILE} next to these features: their teacher has no words, or the file was "
             "lost; fuse with a teacher that has words, or give words= or text="
         )
     return words_of_table(load_text_table(path))

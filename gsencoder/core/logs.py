@@ -101,7 +101,7 @@ class Log:
             self._events.add(step, dict(values))
 
     def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
-        """Writes a picture, uint8 [H, W, 3]: a file `NAME_STEP.png` beside the log, and for TensorBoard."""
+        """Writes a picture, uint8 [H, W, 3]: a file `NAME_STEP.png` next to the log, and for TensorBoard."""
         path = self.path.parent / f"{name}_{step:06d}.png"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

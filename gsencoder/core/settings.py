@@ -79,7 +79,7 @@ class Knob:
         key: where it lies in the stage's settings, with dots between sections ("blend.rays_per_patch").
         values: worth trying, in any order; the default need not be among them.
         exact: the value at which it costs no accuracy; None where there is no such value.
-        needs: values of other knobs, by name, without which it has no effect; it is tried alone beside these.
+        needs: values of other knobs, by name, without which it has no effect; it is tried with these.
     """
 
     name: str

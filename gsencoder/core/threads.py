@@ -66,7 +66,7 @@ compiled = functools.partial(Kernel, fused=False)
 @functools.cache
 def _warn_uncached() -> None:
     warnings.warn(
-        "compiled kernels cannot be stored beside the package or in the user's cache, so that every run compiles them "
+        "compiled kernels cannot be stored next to the package or in the user's cache, so that every run compiles them "
         "again, for up to a minute; NUMBA_CACHE_DIR=FOLDER names a folder that can be written",
         SceneWarning,
         stacklevel=3,

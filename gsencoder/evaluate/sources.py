@@ -78,7 +78,7 @@ def space_of_words(encoder: Encoder, words: Words) -> str | None:
 
 
 def find_table(encoder: Encoder, space: str | None) -> TextTable | None:
-    """The text table beside an encoder: that of a teacher, or without a name that of the first that has one."""
+    """The text table stored with an encoder: that of a teacher, or without a name the first one."""
     return encoder.tables.get(space) if space else encoder.words
 
 

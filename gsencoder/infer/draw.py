@@ -265,7 +265,7 @@ def draw_labels(
         wide, high = draw.textlength(text, font) + 10, 26
         x = float(np.clip(at[0] - wide / 2, 0, max(size[0] - wide, 0)))
         y = float(np.clip(at[1] - high - 4, 0, max(size[1] - high, 0)))
-        # Two labels overlap unless one is wholly beside or above the other.
+        # Two labels overlap unless one is wholly to the side of or above the other.
         for left, top, right, bottom in sorted(occupied, key=lambda rectangle: rectangle[1]):
             if x < right and left < x + wide and y < bottom and top < y + high:
                 y = bottom + 1

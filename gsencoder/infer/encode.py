@@ -78,7 +78,7 @@ class Encoder:
         voxel: edge of the finest grid in metres.
         outputs: what the columns of the network's output mean.
         spaces: the feature spaces, by the names of their teachers.
-        tables: the text tables beside the encoder, by the teacher in whose space they are.
+        tables: the text tables next to the encoder, by the teacher in whose space they are.
         made_by: settings and results of the training, as JSON values.
     """
 
@@ -228,7 +228,7 @@ class Encoder:
     def _confidence(
         self, teacher: str, restored: Float32[np.ndarray, "N channels"], means: Float32[np.ndarray, "N 3"]
     ) -> Float32[np.ndarray, " N"] | None:
-        """See `name_confidence`; None where the weights or the words beside them do not say enough."""
+        """See `name_confidence`; None where the weights or the words next to them do not say enough."""
         outputs, words = self.outputs[teacher], self.tables.get(teacher)
         if not outputs.confidence or words is None or not words.trained:
             return None
@@ -282,7 +282,7 @@ def name_confidence(
 
 
 def file_of_encoder(weights: str) -> Path:
-    """The file of an encoder; what lies beside it belongs to it."""
+    """The file of an encoder; what lies next to it belongs to it."""
     return find_file(weights, "weights") if Path(weights).suffix.lower() == SUFFIX else find_weights(weights)
 
 
@@ -342,7 +342,7 @@ def cut(
     """Cuts the regions of a scene into boxes, halved along their longest side until each fits into a chunk with its
     halo.
 
-    Every row is in the core of exactly one chunk. Where a box has become small beside its halo, the halo is cut
+    Every row is in the core of exactly one chunk. Where a box is small for its halo, the halo is cut
     instead: the nearest rows that fit remain in it.
 
     Args:

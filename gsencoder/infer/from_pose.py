@@ -47,7 +47,7 @@ class FromPoseConfig(CheckedConfig):
     """Over all Gaussians of the scene, so that a word whose best Gaussians are elsewhere is not visible."""
     stride: int | None = option(
         None,
-        "every so many pixels are looked at, in both directions; None = all for features, and every fourth for a "
+        "step of the pixels that are looked at, in both directions; None = all for features, and every fourth for a "
         "memory, whose attention takes longer, or fewer in large views",
         ge=1,
     )
@@ -243,7 +243,7 @@ def view_picture(seen: SeenField) -> UInt8[np.ndarray, "H W 3"]:
 def pose_picture(
     rgb: UInt8[np.ndarray, "H W 3"], seen: SeenField, point: PosePoint, relevancy: Float32[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "H2 W2 3"]:
-    """A view, and beside it the view with the relevancy of a word over it, the word's pixel in a ring in both; small
+    """A view, and next to it the view with the relevancy of a word over it, the word's pixel in a ring in both; small
     views are enlarged.
 
     Args:

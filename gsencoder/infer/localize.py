@@ -75,7 +75,7 @@ class LocalizeConfig(CheckedConfig):
     eps_spacings: float | None = option(
         None,
         "DBSCAN radius in spacings, where eps is not given; empty = 1.5, or more for words whose Gaussians are sparse, "
-        "and clusters whose gap is small beside their size are one",
+        "and clusters whose gap is small for their size are one",
         gt=0,
         lt=math.inf,
     )
@@ -299,9 +299,9 @@ MAX_PARTS = 32
 
 
 def cluster_by_gaps(points: Float32[np.ndarray, "n 3"], smallest: float, min_samples: int) -> Int64[np.ndarray, " n"]:
-    """DBSCAN labels after joining clusters whose gap is small beside their size, −1 = noise.
+    """DBSCAN labels after joining clusters whose gap is small for their size, −1 = noise.
 
-    One thing is seen or fitted in patches, and the gaps between these are small beside the thing: the legs of a table
+    One thing is seen or fitted in patches, and the gaps between these are small for the thing: the legs of a table
     and its top, the halves of a treadmill. The next thing of the name is farther away than a quarter of its size. The
     size is that of what was joined so far, twice the root mean square distance from the center (0.6 of a rod's length,
     0.8 of a square's side), which does not depend on the axes of the world.

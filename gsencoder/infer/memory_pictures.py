@@ -223,7 +223,7 @@ def check_umap() -> None:
 
 def component_scatter(bank: MemoryBank, sample: RawSample, *, umap: bool = False) -> UInt8[np.ndarray, "H W 3"]:
     """Draws raw features as small blue dots and components as red ones, in the plane of the two directions along which
-    the raw features vary most, and with `umap` beside it by UMAP (McInnes et al. 2018) of the cosines that the bank
+    the raw features vary most, and with `umap` also by UMAP (McInnes et al. 2018) of the cosines that the bank
     compares features by, as the paper does."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

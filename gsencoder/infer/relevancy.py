@@ -296,7 +296,7 @@ def otsu(values: Float32[np.ndarray, " n"], bins: int = 256) -> float:
 
 
 SYNONYM = 0.77
-"""Centered cosine of two words from which on they are no rivals. Names that are beside each other in the rooms of the
+"""Centered cosine of two words from which on they are no rivals. Names that are next to each other in the rooms of the
 fit go up to 0.75 (dining table and table); couch and sofa have 0.82, tv and television 0.89."""
 LEAST_ATTAINABLE = 0.3
 """A phrase whose best name has a smaller cosine than this is not understood, and not helped any further."""

@@ -16,7 +16,7 @@ from gsencoder.types import SH_C0, Gaussians
 NEIGHBORS, REACH = 8, 3.0
 """Neighbors of a cell that edges lead to, and the largest distance of these, cells."""
 COLOR = 0.3
-"""Weight of a difference of colors, summed over channels, beside 1 − |cosine| of the normals."""
+"""Weight of a difference of colors, summed over channels, relative to 1 − |cosine| of the normals."""
 SCALE = 1.0
 """k of the paper: a segment of n cells joins along edges up to k / n heavier than those that it holds."""
 SMALLEST = 10

@@ -315,7 +315,7 @@ def _local_mean(
 DOMINANT = 0.5
 """A pixel is of a label if more than this share of its opacity is."""
 BEHIND = 0.02
-"""Share of the depth of a pixel's surface by which an entry may lie behind it, beside one spacing."""
+"""Share of the depth of a pixel's surface by which an entry may lie behind it, plus one spacing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -50,7 +50,7 @@ class TorchNetwork:
             space = outputs.by_teacher[name].space
             if (table.space.text_encoder, table.space.channels) != (space.text_encoder, space.channels):
                 raise InputError(
-                    f"{file.parent}: the words beside the encoder are of {table.space.text_encoder} "
+                    f"{file.parent}: the words next to the encoder are of {table.space.text_encoder} "
                     f"({table.space.channels} channels), and its space {name} has {space.channels} channels and words "
                     f"of {space.text_encoder or 'no text encoder'}: they belong to another encoder; put its own there"
                 )

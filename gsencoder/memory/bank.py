@@ -190,7 +190,7 @@ class _Builder:
             most = min(config.components, features) - (directed < features)
             if most < 1 and directed:
                 raise InputError(
-                    f"bank.components={config.components}: cells at the mean need a component beside that of others; "
+                    f"bank.components={config.components}: cells at the mean need a component besides that of others; "
                     "give 2 or more"
                 )
             most = max(1, most)

@@ -44,7 +44,7 @@ class IndexConfig:
         check_limits(self)
         if self.threshold and self.rows:
             raise InputError(
-                f"rows: {self.rows} rows need threshold=0 as well, got {self.threshold}; beside a budget, which "
+                f"rows: {self.rows} rows need threshold=0 as well, got {self.threshold}; with a budget, which "
                 "chooses both, leave both out"
             )
         if not self.threshold and self.rows < 2:

@@ -86,7 +86,7 @@ class TrainConfig(SourceConfig):
     heads: tuple[str, ...] = option(
         (),
         "the teacher's adapter heads on whose outputs L_render is computed, such as siglip,sam.features; "
-        "they are stored beside the weights; empty = L_render compares the features themselves",
+        "they are stored next to the weights; empty = L_render compares the features themselves",
         names=True,
     )
     model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})

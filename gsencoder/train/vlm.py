@@ -82,12 +82,12 @@ def load_processor(folder: Path) -> tuple[Any, Any]:
     if getattr(processor, "image_processor", None) is None or getattr(processor, "tokenizer", None) is None:
         raise InputError(
             f"{LABEL}: {folder}: has no processor of pictures and text; expected processor_config.json or "
-            "preprocessor_config.json, and a tokenizer, beside the model"
+            "preprocessor_config.json, and a tokenizer, next to the model"
         )
     if not getattr(processor, "chat_template", None):
         raise InputError(
             f"{LABEL}: {folder}: its processor has no chat template, by which `ask` and servers put pictures and "
-            "questions together; expected chat_template.jinja beside the model"
+            "questions together; expected chat_template.jinja next to the model"
         )
     asked = [{"role": "user", "content": [{"type": "image"}, {"type": "text", "text": "question"}]}]
     try:

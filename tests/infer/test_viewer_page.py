@@ -470,5 +470,5 @@ def test_a_thinned_page_uses_most_of_its_size_whatever_was_asked_for(search: Sce
         assert any("megabytes= or max_gaussians= takes more" in note for note in made.notes)
     tight = fitted(search, len(whole.page), 0, max_gaussians=1500)
     assert tight.metas[0]["count"] == 1500
-    with pytest.raises(InputError, match="not even 1,000 Gaussians fit beside the page itself, which takes 0.0 MB;"):
+    with pytest.raises(InputError, match="not even 1,000 Gaussians fit with the page itself, which takes 0.0 MB;"):
         fitted(search, len(whole.page) // 8, 0)

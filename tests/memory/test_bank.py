@@ -251,7 +251,7 @@ def test_a_threshold_is_searched_among_features_of_all_views(monkeypatch: pytest
 def test_one_component_is_refused_where_cells_at_the_mean_need_one_of_their_own() -> None:
     row = MEAN + kinds(1)[0]
     two = np.stack([row, MEAN, row, row]).astype(np.float32)
-    with pytest.raises(InputError, match="cells at the mean need a component beside that of others; give 2 or more"):
+    with pytest.raises(InputError, match="cells at the mean need a component besides that of others; give 2 or more"):
         build_bank(stream([map_of(two, 2, 2)]), SPACE, MEAN, BankConfig(components=1))
     assert len(build_bank(stream([map_of(two, 2, 2)]), SPACE, MEAN, BankConfig(components=2))) == 2
     at_mean = np.repeat(MEAN[None], 4, axis=0)

@@ -170,7 +170,7 @@ def test_settings_of_an_index_and_another_splat_are_refused(folder, tmp_path, ca
     for words, message in (
         (["index.threshold=1.2"], "index.threshold: expected 0 to 1, got 1.2"),
         (["index.threshold=0"], "index.threshold: 0 needs rows=2 or more as well"),
-        (["index.rows=8", "budget.error=0.1"], "index.rows: 8 rows need threshold=0 as well, got 0.9; beside a budget"),
+        (["index.rows=8", "budget.error=0.1"], "index.rows: 8 rows need threshold=0 as well, got 0.9; with a budget"),
         (["decoded=true"], "form=index holds codes"),
     ):
         assert cli.main(["pack", str(folder), "form=index", f"out={out}", *words]) == 2

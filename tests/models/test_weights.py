@@ -148,7 +148,7 @@ def test_words_of_another_encoder_beside_the_weights_are_refused(tmp_path: Path)
     assert Encoder.load(str(tmp_path)).words is not None
     shutil.copyfile(SHIPPED_WEIGHTS / "house" / "words.labels.safetensors", tmp_path / "words.safetensors")
     with pytest.raises(
-        InputError, match=r"words beside the encoder are of .* \(384 channels\), and its space labels has 512"
+        InputError, match=r"words next to the encoder are of .* \(384 channels\), and its space labels has 512"
     ):
         Encoder.load(str(tmp_path))
 

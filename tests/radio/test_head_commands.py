@@ -193,7 +193,7 @@ def test_heads_of_another_backbone_are_refused(world, fused, tmp_path, capsys):
         (("head=dino", "query=mug"), "head=dino: not among the heads at hand: siglip.summary, siglip.features, sam"),
         (("head=sam", "query=mug"), "head sam.features (vit-h): leads to no model with a text side (siglip2, siglip"),
         (("head=siglip.features", "query=mug"), "words are compared with summary heads, since outputs of feature"),
-        (("query=mug",), "there is no words.safetensors beside these features"),
+        (("query=mug",), "there is no words.safetensors next to these features"),
     ],
 )
 def test_a_head_that_words_cannot_be_compared_with_is_refused(world, fused, tmp_path, capsys, words, message):
@@ -226,7 +226,7 @@ def test_features_without_heads_and_heads_without_features_are_refused(world, fu
     shutil.copytree(trained, weights)
     (weights / "heads.safetensors").unlink()
     evaluated = ("evaluate", world.room(1), f"weights={weights}", "head=siglip", *world.text, f"out={tmp_path / 'x'}")
-    assert "head=siglip: no adapter heads lie beside the weights" in refusal(capsys, *evaluated)
+    assert "head=siglip: no adapter heads lie next to the weights" in refusal(capsys, *evaluated)
     shutil.copyfile(fused / "heads.safetensors", weights / "heads.safetensors")
     heads = load_heads(weights / "heads.safetensors")
     save_heads(weights / "heads.safetensors", replace(heads, space=replace(heads.space, weights="other")))

@@ -13,7 +13,7 @@ export class Frames {
   private lastMove = -Infinity;
   private resting: ReturnType<typeof setTimeout> | undefined;
 
-  /** `step` moves the camera by so many seconds and tells whether it does; `render` tells whether all is drawn finely. */
+  /** `step` moves the camera by a number of seconds and tells whether it does; `render` tells whether all is drawn finely. */
   constructor(
     private readonly step: (seconds: number) => boolean,
     private readonly render: (moving: boolean) => Promise<boolean>,

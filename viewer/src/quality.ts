@@ -15,7 +15,7 @@ export class Quality {
     this.cost = (SOFTWARE.test(renderer) ? GUESS.software : GUESS.hardware) / 1e6;
   }
 
-  /** Drawn pixels for each pixel of the page, for a canvas of so many of these. */
+  /** Drawn pixels for each pixel of the page, for a canvas of this number of pixels. */
   ratio(pixels: number, moving: boolean): number {
     const affordable = Math.sqrt((moving ? MOVING : RESTING) / this.cost / Math.max(1, pixels));
     // Steps, so that the canvas is not resized by a hair.

@@ -223,7 +223,7 @@ TEXTS = {
 
 
 def write_report(path: Path, scene: Scene, results: Sequence[TeacherResult], run: Run, *, page: str = "") -> None:
-    """Draws the pictures and writes the report, with a link to a page beside it if there is one."""
+    """Draws the pictures and writes the report, with a link to a page next to it if there is one."""
     assert scene.gaussians is not None
     report = HtmlReport(
         "A room and the words in it",

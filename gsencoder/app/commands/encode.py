@@ -116,18 +116,18 @@ def run(config: EncodeCommandConfig, run: Run) -> None:
 
 
 def _warn_of_missing(encoder: Encoder, file: Path, heads: Path | None, spaces: tuple[str, ...]) -> None:
-    """Warns of adapter heads and words that do not lie beside the weights that were trained with them."""
+    """Warns of adapter heads and words that do not lie next to the weights that were trained with them."""
     trained_with = encoder.made_by.get("settings", {}).get("heads") or ()
     missing = []
     if heads is None and trained_with:
         missing.append(
-            f"the adapter heads {', '.join(trained_with)} that the encoder was trained with do not lie beside {file}; "
+            f"the adapter heads {', '.join(trained_with)} that the encoder was trained with do not lie next to {file}; "
             "head= will not work with its features"
         )
     for name in requested_teachers(encoder, spaces):
         if encoder.spaces[name].text_encoder and name not in encoder.tables:
             missing.append(
-                f"no words of {encoder.spaces[name].text_encoder} lie beside {file}, so the features of {name} have "
+                f"no words of {encoder.spaces[name].text_encoder} lie next to {file}, so the features of {name} have "
                 "none; `localize` needs words= or text="
             )
     for each in missing:

@@ -203,7 +203,7 @@ def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     path = find_heads(file_of_encoder(config.weights))
     if path is None:
         raise InputError(
-            f"head={config.head}: no adapter heads lie beside the weights {config.weights}; train with "
+            f"head={config.head}: no adapter heads lie next to the weights {config.weights}; train with "
             f"heads=[{config.head}]"
         )
     heads = load_heads(path)

@@ -44,7 +44,7 @@ class ExportConfig(CommonConfig):
     space: str = option("", "teacher of the memory, if the folder holds several")
     out: Path | None = option(
         None,
-        "the .onnx file; FILE.summary.json beside it holds the differences from torch",
+        "the .onnx file; FILE.summary.json next to it holds the differences from torch",
         metavar="FILE",
         required=True,
     )
@@ -133,7 +133,7 @@ def run(config: ExportConfig, run: Run) -> None:
         else:
             copy_heads(heads, heads_of_graph(config.out), list(encoder.spaces.values()))
     if heads is not None:
-        run.print(f"{heads_of_graph(config.out)}: the adapter heads that take its features; keep it beside the file")
+        run.print(f"{heads_of_graph(config.out)}: the adapter heads that take its features; keep it next to the file")
     run.print(
         f"{config.out}: {len(model) / 1e6:.1f} MB; {agreement} on {len(compared)} clouds of {min(compared):,} to "
         f"{max(compared):,} Gaussians"

@@ -40,7 +40,7 @@ class LocalizeCommandConfig(QueriesConfig):
     )
     view: tuple[str, ...] = option((), "names of views of the scene, whose cameras are asked like those of pose=")
     pictures: int = option(4, "number of views drawn for each word; 0 = none", ge=0)
-    photos: str = option("", "the scene that was fused; its photographs are drawn beside relevancy, not renders")
+    photos: str = option("", "the scene that was fused; its photographs are drawn next to relevancy, not renders")
     report: bool = option(False, "write report.html, a page with pictures and figures")
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)

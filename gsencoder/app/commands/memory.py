@@ -64,7 +64,7 @@ class MemoryCommandConfig(SourceConfig, CommonConfig):
     pictures: int = option(
         4,
         "number of views, evenly spaced, of which a pixel and the components that it attends to are drawn, "
-        "beside a scatter plot of components and raw features; 0 = no pictures",
+        "next to a scatter plot of components and raw features; 0 = no pictures",
         ge=0,
     )
     umap: bool = option(False, "draw the scatter plot by UMAP, too; needs the package umap-learn")

@@ -98,7 +98,7 @@ def run(config: PackConfig, run: Run) -> None:
 
 
 def _write_sidecars(folder: Path, source: Path, scene: Scene, features: GaussianFeatures, form: Form) -> None:
-    """Writes the words and the adapter heads of the features that lie beside them."""
+    """Writes the words and the adapter heads of the features that lie next to them."""
     words = table_path(source, features.space.text_encoder)
     if words is not None and form in CODED:
         save_text_table(folder / WORDS_FILE, load_text_table(words), dtype="float16")

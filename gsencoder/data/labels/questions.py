@@ -70,7 +70,7 @@ def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question
         return _scanqa(content, file, answered)
     if isinstance(content, dict) and "questions" in content:
         return _sqa3d(content, file, answered)
-    hint = "; these are SQA3D's annotations: give the file of questions beside them"
+    hint = "; these are SQA3D's annotations: give the file of questions next to them"
     raise InputError(
         f"{file}: expected ScanQA's list of questions or SQA3D's object with questions, got {brief(content)}"
         + (hint if isinstance(content, dict) and "annotations" in content else "")
@@ -124,7 +124,7 @@ def _sqa3d(content: Mapping[str, Any], path: Path, answered: bool) -> tuple[Ques
     annotations = path.with_name(path.name.replace("questions", SITUATED))
     if annotations == path or not annotations.is_file():
         raise InputError(
-            f"{path}: no answers beside it; expected a file called like it, with {SITUATED} for questions, such as "
+            f"{path}: no answers next to it; expected a file called like it, with {SITUATED} for questions, such as "
             "v1_balanced_sqa_annotations_test_scannetv2.json"
         )
     content = read_benchmark_json(annotations)

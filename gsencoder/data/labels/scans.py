@@ -410,7 +410,7 @@ def with_counted_views(scene: Scene) -> Scene:
     if scene.views is None or scene.views.instances is None:
         raise InputError(
             f"scene {scene.name}: in how many views its objects show is not known, and it has no instance maps to "
-            "count in; expected a mesh with faces beside the annotation, or pictures of instances"
+            "count in; expected a mesh with faces next to the annotation, or pictures of instances"
         )
     counts = count_pixels(scene.views, np.array([each.id for each in scene.objects], np.int64))
     objects = tuple(

@@ -248,7 +248,7 @@ def score_instances(
             "step."
         )
     if class_agnostic:
-        notes.append("All masks are of one class; published figures, which are of classes, do not stand beside it.")
+        notes.append("All masks are of one class; published figures, which are of classes, are not compared with it.")
     if others:
         notes.append(
             f"Not counted: {counted(others, 'mask')} with a class id that is none of the {len(classes.names)} that are "

@@ -344,7 +344,7 @@ def open_encoder(inputs: Inputs, path: Path) -> Iterator[Opened]:
         """The first teacher of an encoder that has words, its words, and labels fused in their space."""
         tables = encoder_of(weights, 0.0, 0).tables
         if not tables:
-            raise InputError(f"{weights}: no words lie beside the encoder, so that nothing names what it says")
+            raise InputError(f"{weights}: no words lie next to the encoder, so that nothing names what it says")
         space, words = next(iter(tables.items()))
         teacher = LabelsConfig().build(scene, words)
         return space, words, teacher, fuse(scene, teacher, inputs.fusion).features

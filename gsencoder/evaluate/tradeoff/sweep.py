@@ -323,7 +323,7 @@ NORMAL_MAD = 1.4826
 
 
 def summarize(records: Sequence[Record], base: Sequence[Record], phase: Phase) -> SettingResult:
-    """One setting's records, each of another scene, beside those of the base on the same scenes."""
+    """One setting's records, each of another scene, and those of the base on the same scenes."""
     by_scene = {record.scene: record for record in base}
     pairs = [(record, by_scene[record.scene]) for record in records if record.scene in by_scene]
     logs = [float(np.median(_log_ratios(record, other, "cpu_seconds"))) for record, other in pairs]
@@ -415,7 +415,7 @@ NOISE_ERRORS = 2.0
 def effective_knobs(
     knobs: Sequence[Knob], rows: Sequence[Sequence[Record]], base: Sequence[Record], cost: str
 ) -> list[str]:
-    """Knobs of which a value, changed alone or beside what it needs, moves cost or a score by more than noise."""
+    """Knobs of which a value, changed alone or with what it needs, moves cost or a score by more than noise."""
     by_label = {row[0].label: row for row in rows}
     with_effect = set()
     for knob in knobs:
@@ -490,7 +490,7 @@ def plot_page(results: Mapping[str, Any]) -> bytes:
 
 
 def plot_picture(stages: Sequence[StageResult]) -> bytes:
-    """The same as a PNG: a panel a stage, a color for each changed knob, its value beside each point, the Pareto front
+    """The same as a PNG: a panel a stage, a color for each changed knob, its value at each point, the Pareto front
     ringed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

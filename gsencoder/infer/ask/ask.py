@@ -178,7 +178,7 @@ class AskConfig(CheckedConfig):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prompt:
-    """What a VLM is shown and told.
+    """What a VLM sees and reads.
 
     Attributes:
         targets: what the pictures are of, in the order of their marks.

@@ -42,7 +42,7 @@ class KeyFilter:
     def clean(self, text: str, longest: int | None = None) -> str:
         """Text without the key, and only then cut to `longest` characters."""
         parts, at = [], 0
-        # Of a long key with letters that begin escapes, the letters are not always told apart.
+        # Of a long key with letters that begin escapes, the letters cannot always be distinguished.
         text = text.replace(self._key, REDACTED) if self._pattern else text
         while self._pattern and (match := self._pattern.search(text, at)):
             parts += [text[at : match.start()], REDACTED]
@@ -319,7 +319,7 @@ class VlmServer:
 
 def _ends_within(seconds: float, work: Callable[[], None]) -> bool:
     """Whether work in a thread of its own has ended after this many seconds; else it is left alone. A connection that
-    stays alive without a word is told from an answer by the clock alone, and from outside."""
+    stays alive without a word differs from an answer by the clock alone, and from outside."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(seconds)

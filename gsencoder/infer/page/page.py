@@ -344,7 +344,7 @@ def fitting_page(
         searches = []
         if limit < FEWEST_GAUSSIANS:
             raise InputError(
-                f"megabytes={max_bytes / 1e6:g}: not even {FEWEST_GAUSSIANS:,} Gaussians fit beside the page itself, "
+                f"megabytes={max_bytes / 1e6:g}: not even {FEWEST_GAUSSIANS:,} Gaussians fit with the page itself, "
                 f"which takes {fixed / 1e6:.1f} MB; give megabytes= a larger number"
                 + (", or photographs=0" if any(each.meta["photographViews"] for each in containers) else "")
             )

@@ -72,7 +72,7 @@ class HtmlReport:
         self._add(f"<p>{escape(text)}</p>")
 
     def link(self, text: str, file: str) -> None:
-        """Adds a link to a file beside the page."""
+        """Adds a link to a file next to the page."""
         self._add(f'<p><a href="{escape(quote(file))}">{escape(text)}</a></p>')
 
     def pictures(

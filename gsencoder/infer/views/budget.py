@@ -48,7 +48,7 @@ OPTIONS_SET_BY_BUDGET: Mapping[str, tuple[str, ...]] = {
     "seconds": ("candidates",),
     "megabytes": ("width", "height", "frame_side"),
 }
-"""Beside a limit of error, seconds set nothing: it is one about what `choose.candidates` show, which are all judged."""
+"""With a limit of error, seconds set nothing: it is one about what `choose.candidates` show, which are all judged."""
 CANDIDATES = (8, 12, 16, 24, 32, 48, 64)
 """Numbers that are chosen among; the last is that of preset=exact. The first is judged in any case, and timed."""
 SAMPLED = 2
@@ -288,7 +288,7 @@ def pictures_within(
 
     All are encoded at the least side; by how much the bytes of larger ones grow a few tell. A side that takes more than
     was predicted is made smaller. Where the least side takes too much, the views that were chosen last are left out,
-    or, beside a limit of error, none.
+    or, with a limit of error, none.
 
     Returns:
         The views that are kept, with cameras in the sizes of the pictures; the pictures; the megabytes that were

@@ -28,9 +28,9 @@ SOLID_WEIGHT = 0.5
 MIN_MARKED_PIXELS = 12
 """Pixels that must show a target for it to be marked."""
 MAX_MARK_COVER = 0.25
-"""A disc stands on its target if it hides no more of it than that, and beside it otherwise."""
+"""A disc stands on its target if it hides no more of it than that, and next to it otherwise."""
 DIRECTIONS = 8
-"""Ways from a target to places beside it."""
+"""Ways from a target to places next to it."""
 
 
 def draw_marks(
@@ -39,7 +39,7 @@ def draw_marks(
     """A picture with a numbered disc for each target that it shows, from 1 on in their order.
 
     A disc stands on the pixel of the target that is nearest to the middle of what is visible of it; where it would
-    hide a small target, another disc, or leave the picture, it stands beside it, and a line leads to that pixel.
+    hide a small target, another disc, or leave the picture, it stands next to it, and a line leads to that pixel.
 
     Returns:
         The picture, and the numbers that it carries.

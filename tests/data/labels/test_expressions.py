@@ -306,7 +306,7 @@ def test_a_wrong_entry_of_scanqa_is_named(tmp_path: Path, content: Any, message:
         ([question(1)], [annotation(1, scene_id="scene1")], "about scene0050_00, and its annotation about scene1"),
         ([question(1)], [annotation(1, answers=[])], r"annotations\[0\]: answers must be a list of objects"),
         ([question(1)], [annotation(1, position={"x": 1})], r"position.y must be a number, got nothing"),
-        ([question(1)], None, "no answers beside it; expected a file called like it"),
+        ([question(1)], None, "no answers next to it; expected a file called like it"),
         ([question(1, situation="")], [annotation(1)], r"questions\[0\]: situation is empty"),
     ],
 )
