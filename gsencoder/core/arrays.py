@@ -83,9 +83,8 @@ def check_rows(owner: str, name: str, good: np.ndarray, expected: str, values: n
 def check_finite(owner: str, name: str, array: np.ndarray) -> None:
     if array.size == 0:
         return
-    flat = array.reshape(len(array), -1)
-    # The sum of a row is finite unless an entry is not (or it overflows): one pass, no boolean array of full size.
+    # The sum is finite unless an entry is not (or it overflows): one pass, no boolean array of full size.
     with np.errstate(over="ignore", invalid="ignore"):
-        suspicious = ~np.isfinite(flat.sum(axis=1, dtype=np.float64))
-    if suspicious.any():
-        check_rows(owner, name, np.isfinite(flat).all(axis=1), "finite values", array)
+        if np.isfinite(array.sum(dtype=np.float64)):
+            return
+    check_rows(owner, name, np.isfinite(array.reshape(len(array), -1)).all(axis=1), "finite values", array)

@@ -121,11 +121,12 @@ class Gaussians:
         for name in self.__dataclass_fields__:
             check_finite("Gaussians", name, getattr(self, name))
         with np.errstate(over="ignore"):  # A norm beyond float32 is infinite, and refused.
-            norms = np.linalg.norm(self.quats, axis=1)
+            norms = np.sqrt(np.einsum("nk,nk->n", self.quats, self.quats))
         check_rows(
             "Gaussians", "quats", np.asarray(np.abs(norms - 1) <= UNIT_TOLERANCE), "unit quaternions", self.quats
         )
-        check_rows("Gaussians", "scales", np.asarray((self.scales > 0).all(axis=1)), "scales > 0", self.scales)
+        if not (self.scales > 0).all():
+            check_rows("Gaussians", "scales", np.asarray((self.scales > 0).all(axis=1)), "scales > 0", self.scales)
         inside = np.asarray((self.opacities >= 0) & (self.opacities <= 1))
         check_rows("Gaussians", "opacities", inside, "values in [0, 1]", self.opacities)
 
