@@ -264,7 +264,9 @@ def _made_rooms(name: str, words: Words | None, config: SourceConfig) -> list[Te
     from gsencoder.data.furnished.kinds import kinds
 
     box = np.zeros(3)
-    objects = [SceneObject(id=1 + i, name=kind, aabb_min=box, aabb_max=box) for i, kind in enumerate(kinds())]
+    # Kinds that are left out are no wrong answers either.
+    known = [kind for kind in kinds() if kind not in config.rooms.without]
+    objects = [SceneObject(id=1 + i, name=kind, aabb_min=box, aabb_max=box) for i, kind in enumerate(known)]
     return [config.teachers_by_name[name].build(Scene(name="rooms", objects=tuple(objects)), words)]
 
 
@@ -305,7 +307,7 @@ def _preparation_settings(
         "seeds": plain(config.seeds),
         "teacher": plain(teacher),
         "prepare": plain(config.prepare),
-        "rooms": bool(config.rooms.libraries),
+        "rooms": list(config.rooms.without) if config.rooms.libraries else None,
         **{"splat": config.splat, "orbits": config.orbits, "cameras": config.cameras},
     }
     # Heads are measured and added when they are asked for; what is prepared besides does not depend on them.

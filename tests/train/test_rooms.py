@@ -13,10 +13,12 @@ from training_scenes import SMALL
 from gsencoder.core.errors import InputError
 from gsencoder.data.furnished.kinds import kinds
 from gsencoder.data.furnished.library import load_libraries
+from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
+from gsencoder.text.table import make_text_table
 from gsencoder.train import samples
 from gsencoder.train.loop import micro_batches
 from gsencoder.train.losses import LossConfig, TeacherRecipe
-from gsencoder.train.prepare_scenes import SourceConfig
+from gsencoder.train.prepare_scenes import SourceConfig, _made_rooms
 from gsencoder.train.rooms import RoomStream, models_of
 from gsencoder.train.samples import (
     Augmentation,
@@ -160,6 +162,10 @@ def test_kinds_may_be_left_out_whole_and_misspelled_ones_are_named(library: Path
     config = RoomsConfig(libraries=(str(library),), without=("couch", "bed"))
     every = {model.kind.name for model in models_of(RoomsConfig(libraries=(str(library),)))}
     assert every - {model.kind.name for model in models_of(config)} == {"couch", "bed"}
+    words = make_text_table(list(kinds()), np.eye(len(kinds()), dtype=np.float32), "words")
+    (teacher,) = _made_rooms("labels", words, SourceConfig(teacher=LabelsConfig(), rooms=config))
+    assert isinstance(teacher, LabelsTeacher)
+    assert set(teacher.names) == {"other", *kinds()} - {"couch", "bed"}
     with pytest.raises(InputError, match=r"rooms\.without=cauch: no such kind; the kinds are"):
         RoomsConfig(without=("cauch",))
 
