@@ -10,9 +10,9 @@ from furniture import write_library
 
 from gsencoder.data.furnished import plan
 from gsencoder.data.furnished.kinds import ROOM_TYPES, STRUCTURE, kinds
-from gsencoder.data.furnished.library import Model, load_libraries
+from gsencoder.data.furnished.library import Mesh, Model, load_libraries
 from gsencoder.data.furnished.plan import THICKNESS, Box, Home, Item, Room, plan_home
-from gsencoder.data.furnished.shapes import MadeModel, Rectangle, made_model, makes, panels
+from gsencoder.data.furnished.shapes import MadeModel, Rectangle, TurnedRanges, made_model, makes, panels
 
 SEEDS = range(12)
 
@@ -179,6 +179,28 @@ def test_a_make_of_our_own_is_as_large_as_it_says_and_unlike_the_next(kind: str)
     assert len(sizes) == 20
     again = made_model(kind, np.random.default_rng(19))
     np.testing.assert_array_equal(again.mesh.vertices, mesh.vertices)
+
+
+def depth_below(mesh: Mesh, height: float) -> float:
+    """How far a plumb line hangs down from a height at the middle of a mesh."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    rays = o3d.core.Tensor([[0.003, 0.002, height, 0, 0, -1]], o3d.core.float32)
+    return float(scene.cast_rays(rays)["t_hit"].numpy()[0])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_vessels_are_open_above_and_tables_carry_things_at_their_top(seed: int) -> None:
+    tub, (ranges,) = made_model("bathtub", np.random.default_rng(seed)), makes()["bathtub"]
+    assert tub.top is None
+    assert depth_below(tub.mesh, tub.size[2]) > 0.7 * tub.size[2]
+    assert ranges.width[0] <= tub.size[0] <= ranges.width[1]
+    (turned,) = (each for each in makes()["table"] if isinstance(each, TurnedRanges))
+    built = turned.build(np.random.default_rng(seed))
+    assert built.top is not None
+    assert depth_below(built.mesh, 2.0) == pytest.approx(2.0 - built.top, abs=1e-5)
 
 
 def test_makes_of_our_own_come_at_the_share_asked_for_and_of_kinds_that_the_libraries_have(
