@@ -6,9 +6,10 @@
 
 A make is one model of the libraries; one in four of each kind with three or more is held out of every training. The
 splat of each home is what a walk sees, as seeds of 2 cm. `things` is the share of Gaussians of held-out makes whose
-most probable name, of all kinds, is the right one; `structure` that of walls, floors and ceilings; `boxes` the share of
-those things for whose name the first box has an IoU of 0.25 or more with one of them; with --kinds, `wrong` is the same
-for names of theirs that the home lacks. Means over homes, with the standard error.
+most probable name, of all kinds, is the right one, and `broader` that of those with the right one or a broader word for
+it ("chair" for an office chair); `structure` is that of walls, floors and ceilings; `boxes` the share of those things
+for whose name the first box has an IoU of 0.25 or more with one of them; with --kinds, `wrong` is the same for names of
+theirs that the home lacks. Means over homes, with the standard error.
 """
 
 import argparse
@@ -112,6 +113,7 @@ def main() -> None:
     space = next(iter(encoder.tables))
     names = list(kinds())
     structure = np.array([name in STRUCTURE for name in names])
+    fits = np.array([[found in (kind.name, *kind.hypernyms) for kind in kinds().values()] for found in names])
     table: dict[str, dict[str, list[float]]] = {each: defaultdict(list) for each in arguments.recolor or ["as it is"]}
     of_kind: dict[str, list[float]] = defaultdict(lambda: [0, 0])
     for number, (labels, codes, of_items) in enumerate(made_homes(models, arguments.seed, arguments.rooms)):
@@ -121,8 +123,10 @@ def main() -> None:
             gaussians = labels.gaussians()
             gaussians = replace(gaussians, sh=RECOLORS[title](gaussians.sh).astype(np.float32))
             features = encoder.encode(gaussians, space=space, up=np.array([0.0, 0.0, 1.0]))
-            right = names_of(features, words) == codes
+            found = names_of(features, words)
+            right = found == codes
             rows["things"].append(float(right[thing].mean()) if thing.any() else np.nan)
+            rows["broader"].append(float(fits[found, codes][thing].mean()) if thing.any() else np.nan)
             rows["structure"].append(float(right[structure[codes]].mean()))
             if title == "as it is":
                 for code in np.unique(codes[thing]):

@@ -24,7 +24,7 @@ from gsencoder.core.threads import ahead
 from gsencoder.data.up import scaled, upright_gaussians
 from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
-from gsencoder.infer.segments import LAST_CELL, average_within, cell_keys, surface_segments
+from gsencoder.infer.segments import CELL, LAST_CELL, average_within, cell_keys, surface_segments
 from gsencoder.models.grid import cut_scene_curves
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, find_weights
 from gsencoder.text.table import TextTable
@@ -64,10 +64,12 @@ class EncodeConfig(CheckedConfig):
     grids: tuple[float, ...] = option(
         (), "edges of token grids, metres, whose outputs are averaged; empty = those of the weights", gt=0, lt=math.inf
     )
-    segments: bool = option(
-        False,
-        "average the outputs within segments of surface of one direction and color, which names large things better; "
-        "things of few cells take the name of what they stand on",
+    segments: float = option(
+        0.0,
+        "share, 0 to 1, of the mean over its segment of surface (of one direction and color) in the output of a "
+        "Gaussian; 0.5 names large things better and still tells small ones from what they stand on",
+        ge=0,
+        le=1,
     )
 
 
@@ -183,9 +185,9 @@ class Encoder:
             for each in values.values():
                 each /= len(grids)
         if config.segments:
-            segments = surface_segments(gaussians, self.voxel)
+            segments = surface_segments(gaussians, CELL)
             for each in values.values():
-                average_within(segments, each)
+                average_within(segments, each, config.segments)
         return {
             teacher: self.outputs[teacher].features(each, self._confidence(teacher, each, gaussians.means))
             for teacher, each in values.items()

@@ -1,4 +1,4 @@
-"""Segments of a splat: pieces of surface of one direction and color, in which an encoder's outputs are averaged.
+"""Segments of a splat: pieces of surface of one direction and color, within which an encoder's outputs are averaged.
 
 Cells of a grid are joined along the edges between neighbors, those that differ least first, while an edge is not much
 heavier than those that the segments on both sides hold (Felzenszwalb and Huttenlocher 2004, "Efficient Graph-Based
@@ -13,6 +13,8 @@ from jaxtyping import Float32, Float64, Int64
 from gsencoder.core.threads import kernel
 from gsencoder.types import SH_C0, Gaussians
 
+CELL = 0.05
+"""Edge of the cells for splats in metres: finer ones follow a depth camera's noise."""
 NEIGHBORS, REACH = 8, 3.0
 """Neighbors of a cell that edges lead to, and the largest distance of these, cells."""
 COLOR = 0.3
@@ -65,11 +67,14 @@ def surface_segments(gaussians: Gaussians, cell: float) -> Int64[np.ndarray, " N
     return np.unique(roots, return_inverse=True)[1][cell_of]
 
 
-def average_within(segments: Int64[np.ndarray, " N"], values: Float32[np.ndarray, "N channels"]) -> None:
-    """Replaces the rows of each segment by their mean."""
+def average_within(
+    segments: Int64[np.ndarray, " N"], values: Float32[np.ndarray, "N channels"], share: float = 1.0
+) -> None:
+    """Moves the rows of each segment to their mean, by a share of the way."""
     counts = np.bincount(segments)
     for column in values.T:
-        column[:] = (np.bincount(segments, column) / counts)[segments]
+        means = (np.bincount(segments, column) / counts).astype(np.float32)
+        column += np.float32(share) * (means[segments] - column)
 
 
 def _normals(neighborhoods: Float64[np.ndarray, "n k 3"]) -> Float64[np.ndarray, "n 3"]:

@@ -92,8 +92,8 @@ class TrainConfig(SourceConfig):
     model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
     init: str = option(
         "",
-        "weights to start from, made with the same model= settings: a folder or file written by `train`, or the name "
-        "of an encoder that comes with gsencoder; empty = random parameters",
+        "weights to start from, made with the same model= settings (but for voxel where inputs has cell): a folder or "
+        "file written by `train`, or the name of an encoder that comes with gsencoder; empty = random parameters",
     )
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: bool = option(True, "turn, mirror, scale, shift, thin and relight samples at random")

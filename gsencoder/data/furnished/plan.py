@@ -351,8 +351,11 @@ class _Furnisher:
         return self._wall(kind, at=(wall, where), scale=size, model=model)
 
     def _bedding(self, bed: Box, angle: float) -> None:
-        """Pillows at the head of a bed and a blanket on it."""
-        z = min(self.supports[-1][1], bed.z1) if self.supports and self.supports[-1][0] == bed else bed.z0 + 0.5
+        """Pillows at the head of a bed and a blanket on it; none on a loft bed."""
+        is_support = bool(self.supports) and self.supports[-1][0] == bed
+        if not is_support and bed.z1 > 1.2:
+            return
+        z = min(self.supports[-1][1], bed.z1) if is_support else bed.z0 + 0.5
         head = np.array([round(math.cos(angle)), round(math.sin(angle))])
         center = np.array([bed.x0 + bed.x1, bed.y0 + bed.y1]) / 2
         half = np.array([bed.x1 - bed.x0, bed.y1 - bed.y0]) / 2
