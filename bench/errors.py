@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from subprocess import CalledProcessError
 
-from gsencoder.core.errors import InputError, one_line
+from gsencoder.core.errors import InputError, listed, one_line
 
 
 @contextmanager
@@ -61,3 +61,15 @@ def comma_separated(text: str) -> list[str]:
     if not all(words):
         raise argparse.ArgumentTypeError(f"expected words separated by commas, got an empty one in {text!r}")
     return words
+
+
+def matching_names(parser: argparse.ArgumentParser, folder: Path, pattern: str) -> list[Path]:
+    """What is in a folder and has a name of the pattern --names, in order; an error of the parser where nothing has."""
+    try:
+        paths = sorted(folder.glob(pattern))
+    except (ValueError, NotImplementedError) as error:
+        parser.error(f"--names {pattern!r}: not a pattern of names ({error}); expected one such as 'train_0*'")
+    if not paths:
+        present = sorted(path.name for path in folder.iterdir())
+        parser.error(f"--names {pattern!r}: matches nothing in {folder} ({listed(present) or 'empty'})")
+    return paths

@@ -113,7 +113,7 @@ def main() -> None:
     space = next(iter(encoder.tables))
     names = list(kinds())
     structure = np.array([name in STRUCTURE for name in names])
-    fits = np.array([[found in (kind.name, *kind.hypernyms) for kind in kinds().values()] for found in names])
+    fits = np.array([[name in (kind.name, *kind.hypernyms) for kind in kinds().values()] for name in names])
     table: dict[str, dict[str, list[float]]] = {each: defaultdict(list) for each in arguments.recolor or ["as it is"]}
     of_kind: dict[str, list[float]] = defaultdict(lambda: [0, 0])
     for number, (labels, codes, of_items) in enumerate(made_homes(models, arguments.seed, arguments.rooms)):
@@ -123,10 +123,10 @@ def main() -> None:
             gaussians = labels.gaussians()
             gaussians = replace(gaussians, sh=RECOLORS[title](gaussians.sh).astype(np.float32))
             features = encoder.encode(gaussians, space=space, up=np.array([0.0, 0.0, 1.0]))
-            found = names_of(features, words)
-            right = found == codes
+            predicted = names_of(features, words)
+            right = predicted == codes
             rows["things"].append(float(right[thing].mean()) if thing.any() else np.nan)
-            rows["broader"].append(float(fits[found, codes][thing].mean()) if thing.any() else np.nan)
+            rows["broader"].append(float(fits[predicted, codes][thing].mean()) if thing.any() else np.nan)
             rows["structure"].append(float(right[structure[codes]].mean()))
             if title == "as it is":
                 for code in np.unique(codes[thing]):

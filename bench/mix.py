@@ -18,9 +18,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from errors import existing_folder, one_line_errors, output_folder
-
-from gsencoder.core.errors import listed
+from errors import existing_folder, matching_names, one_line_errors, output_folder
 
 SEEDS_ALONE = ["optimize.steps=0", "holdout=0"]
 
@@ -52,15 +50,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--options", nargs="*", default=["raster.eps2d=0.1"])
     arguments = parser.parse_args()
-    try:
-        scenes = sorted(arguments.house.glob(arguments.names))
-    except (ValueError, NotImplementedError) as error:
-        parser.error(f"--names {arguments.names!r}: not a pattern of names ({error}); expected one such as 'train_0*'")
-    if not scenes:
-        present = sorted(path.name for path in arguments.house.iterdir())
-        parser.error(
-            f"--names {arguments.names!r}: matches nothing in {arguments.house} ({listed(present) or 'empty'})"
-        )
+    scenes = matching_names(parser, arguments.house, arguments.names)
     arguments.out.mkdir(parents=True, exist_ok=True)
     for scene in scenes:
         add(scene, arguments.out / scene.name, SEEDS_ALONE)

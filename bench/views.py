@@ -50,7 +50,7 @@ def furniture(objects: Sequence[SceneObject]) -> list[SceneObject]:
 
 
 def objects_of(path: str, large: bool) -> tuple[Scene, list[tuple[Target, SceneObject]]]:
-    """A scene with Gaussians, and what was found of its objects besides the labels."""
+    """A scene with Gaussians, and what was found of its objects, for comparison with the labels."""
     words = load_text_table(find_file(WORDS, "words"))
     scene = with_gaussians(load_scene(path))
     features = fuse(scene, LabelsConfig(words=WORDS).build(scene, words)).features

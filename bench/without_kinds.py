@@ -9,14 +9,14 @@ other files are links to those of HOUSE.
 """
 
 import argparse
-import json
 from typing import Any
 
-from errors import comma_separated, existing_folder, one_line_errors, output_folder
+from errors import comma_separated, existing_folder, matching_names, one_line_errors, output_folder
 
 from gsencoder.core.errors import listed
-from gsencoder.core.files import atomic_file
+from gsencoder.core.files import write_json
 from gsencoder.data.furnished.kinds import kinds
+from gsencoder.data.readers.transforms_json import read_json
 
 
 def without_names(objects: list[dict[str, Any]], names: list[str]) -> set[str]:
@@ -42,17 +42,16 @@ def main() -> None:
     if unknown := [name for name in arguments.kinds if name not in kinds()]:
         parser.error(f"--kinds {unknown[0]}: no such kind; the kinds are {listed(list(kinds()), 8)}")
     lost = set[str]()
-    for scene in sorted(arguments.house.glob(arguments.names)):
+    for scene in matching_names(parser, arguments.house, arguments.names):
+        objects = read_json(scene / "objects.json")
+        lost |= without_names(objects, arguments.kinds)
         target = arguments.out / scene.name
         target.mkdir(parents=True, exist_ok=True)
         for path in scene.iterdir():
             link = target / path.name
             if path.name != "objects.json" and not link.is_symlink():
                 link.symlink_to(path.resolve())
-        objects = json.loads((scene / "objects.json").read_text(encoding="utf-8"))
-        lost |= without_names(objects, arguments.kinds)
-        with atomic_file(target / "objects.json") as file:
-            file.write(json.dumps(objects).encode())
+        write_json(target / "objects.json", objects)
     print(f"without names: {listed(sorted(lost), 40) or 'none'}")
 
 

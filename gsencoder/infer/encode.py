@@ -24,7 +24,7 @@ from gsencoder.core.threads import ahead
 from gsencoder.data.up import scaled, upright_gaussians
 from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
-from gsencoder.infer.segments import CELL, LAST_CELL, average_within, cell_keys, surface_segments
+from gsencoder.infer.segments import LAST_CELL, SEGMENT_CELL, average_within, cell_keys, surface_segments
 from gsencoder.models.grid import cut_scene_curves
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, find_weights
 from gsencoder.text.table import TextTable
@@ -185,7 +185,7 @@ class Encoder:
             for each in values.values():
                 each /= len(grids)
         if config.segments:
-            segments = surface_segments(gaussians, CELL)
+            segments = surface_segments(gaussians, SEGMENT_CELL)
             for each in values.values():
                 average_within(segments, each, config.segments)
         return {

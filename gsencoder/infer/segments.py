@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64, Int64
 from gsencoder.core.threads import kernel
 from gsencoder.types import SH_C0, Gaussians
 
-CELL = 0.05
+SEGMENT_CELL = 0.05
 """Edge of the cells for splats in metres: finer ones follow a depth camera's noise."""
 NEIGHBORS, REACH = 8, 3.0
 """Neighbors of a cell that edges lead to, and the largest distance of these, cells."""

@@ -15,7 +15,7 @@ from training_scenes import SMALL
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer import encode as module
 from gsencoder.infer.encode import EncodeConfig, Encoder, cut, scene_regions
-from gsencoder.infer.segments import CELL, surface_segments
+from gsencoder.infer.segments import SEGMENT_CELL, surface_segments
 from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
@@ -164,7 +164,7 @@ def test_features_on_several_grids_are_the_mean_of_those_on_each() -> None:
 def test_features_in_segments_are_the_mean_over_them_in_any_unit() -> None:
     network, scene = encoder(), random_gaussians(400, seed=2)
     plain = encode(scene, network, WHOLE).decode()
-    segments = surface_segments(scene, CELL)
+    segments = surface_segments(scene, SEGMENT_CELL)
     assert 1 < segments.max() < len(scene) - 1
     means = np.stack([plain[segments == number].mean(axis=0) for number in range(segments.max() + 1)])
     half = encode(scene, network, replace(WHOLE, segments=0.5)).decode()

@@ -165,7 +165,7 @@ Span = tuple[float, float]
 SIDES, RINGS = 24, 9
 """Sides of a turned shape, and levels at which its profile is sampled at least."""
 _TIP = 0.005
-"""Radius of a turned shape on its axis, as a share of its largest."""
+"""Radius of a turned shape on its axis, as a share of half its width."""
 
 
 class Built(NamedTuple):

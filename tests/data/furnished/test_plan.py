@@ -170,6 +170,8 @@ def test_a_make_of_our_own_is_as_large_as_it_says_and_unlike_the_next(kind: str)
         np.testing.assert_allclose(
             mesh.extent, [[-size[0] / 2, -size[1] / 2, 0], [size[0] / 2, size[1] / 2, size[2]]], atol=1e-6
         )
+        # Only vessels and lamps carry nothing.
+        assert model.top is not None or any(isinstance(each, TurnedRanges) for each in makes()[kind])
         assert model.top is None or 0 < model.top <= size[2] + 1e-6
         assert mesh.materials.max() < len(model.finishes)
         corners = mesh.vertices[mesh.faces].astype(np.float64)
