@@ -81,7 +81,7 @@ def write_library(path: Path, text: str | None = None, files: Mapping[str, bytes
         "box/back.png": picture.getvalue(),
         **files,
     }
-    with zipfile.ZipFile(path, "w") as archive:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in contents.items():
             if content:
                 archive.writestr(name, content)

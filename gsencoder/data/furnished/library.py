@@ -10,8 +10,10 @@ import io
 import re
 import warnings
 import zipfile
+import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -145,7 +147,9 @@ def _read_catalogue(file: Path) -> tuple[list[LibraryModel], int]:
     those that do not stand in rooms."""
     with error_prefix(file):
         rows: dict[int, dict[str, str]] = defaultdict(dict)
-        for line in _read_member(file, CATALOGUE).decode("latin-1").splitlines():
+        with _opened(file) as archive:
+            catalogue = _read_member(archive, CATALOGUE)
+        for line in catalogue.decode("latin-1").splitlines():
             if match := re.fullmatch(r"\s*(\w+)#(\d+)\s*=\s*(.*?)\s*", line):
                 rows[int(match[2])][match[1]] = re.sub(
                     r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), match[3]
@@ -197,18 +201,24 @@ def _metres(row: dict[str, str], key: str) -> float:
         raise InputError(f"expected a number of centimetres as its {key}, got {row.get(key, 'none')!r}") from None
 
 
-def _read_member(file: Path, name: str) -> bytes:
+@contextmanager
+def _opened(file: Path) -> Iterator[zipfile.ZipFile]:
+    """A library that is open in the block."""
+    try:
+        with readable(file), zipfile.ZipFile(file) as archive:
+            yield archive
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise InputError(f"expected a zip archive, got a damaged one ({error})") from error
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
     """Reads a file of a library."""
-    with readable(file):
-        try:
-            with zipfile.ZipFile(file) as archive:
-                if archive.getinfo(name).file_size > MAX_FILE:
-                    raise InputError(f"{name}: is larger than {MAX_FILE >> 20} MiB")
-                return archive.read(name)
-        except KeyError:
-            raise InputError(f"expected the file {name} in it; the library is incomplete") from None
-        except (zipfile.BadZipFile, EOFError, ValueError) as error:
-            raise InputError(f"expected a zip archive, got a damaged one ({error})") from error
+    try:
+        if archive.getinfo(name).file_size > MAX_FILE:
+            raise InputError(f"{name}: is larger than {MAX_FILE >> 20} MiB")
+        return archive.read(name)
+    except KeyError:
+        raise InputError(f"expected the file {name} in it; the library is incomplete") from None
 
 
 class _Members(Mapping[str, bytes]):
@@ -237,15 +247,12 @@ def _read_mesh(file: Path, name: str) -> Mesh:
     """
     import trimesh
 
-    with zipfile.ZipFile(file) as archive, warnings.catch_warnings():
+    with _opened(file) as archive, warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        content = _read_member(archive, name)
         resolver = trimesh.resolvers.ZipResolver(_Members(archive), namespace=str(Path(name).parent))
         try:
-            scene = trimesh.load(
-                io.BytesIO(_read_member(file, name)), file_type="obj", resolver=resolver, process=False, force="scene"
-            )
-        except InputError:
-            raise
+            scene = trimesh.load(io.BytesIO(content), file_type="obj", resolver=resolver, process=False, force="scene")
         except Exception as error:
             raise InputError(f"{name}: expected an OBJ file ({type(error).__name__}: {error})") from error
     parts = [each for each in scene.dump() if isinstance(each, trimesh.Trimesh) and len(each.faces)]

@@ -1,6 +1,7 @@
 """Furniture libraries: sizes, axes, materials, makes, and what is wrong with a file."""
 
 import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,18 @@ def test_an_incomplete_library_and_a_model_without_faces_are_named(tmp_path: Pat
     empty = write_library(tmp_path / "empty.sh3f", files={"box/box.obj": b"v 0 0 0\nv 1 1 1\n"})
     with pytest.raises(InputError, match=r"model test#1: .*(no faces|expected an OBJ file)"):
         load_libraries([empty])[0].mesh  # noqa: B018
+
+
+@pytest.mark.parametrize("bit", range(8))
+def test_a_flipped_bit_of_a_model_is_named(bit: int, tmp_path: Path) -> None:
+    path = write_library(tmp_path / "flipped.sh3f")
+    with zipfile.ZipFile(path) as archive:
+        member = archive.getinfo("box/box.obj")
+    content = bytearray(path.read_bytes())
+    content[member.header_offset + 30 + len(member.filename) + member.compress_size // 3] ^= 1 << bit
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"model test#1: expected a zip archive, got a damaged one"):
+        load_libraries([path])[0].mesh  # noqa: B018
 
 
 def test_names_in_another_language_are_warned_of(tmp_path: Path) -> None:
