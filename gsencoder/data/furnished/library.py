@@ -207,7 +207,9 @@ def _opened(file: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with readable(file), zipfile.ZipFile(file) as archive:
             yield archive
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
         raise InputError(f"expected a zip archive, got a damaged one ({error})") from error
 
 

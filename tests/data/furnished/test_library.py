@@ -171,6 +171,22 @@ def test_a_flipped_bit_of_a_model_is_named(bit: int, tmp_path: Path) -> None:
         load_libraries([path])[0].mesh  # noqa: B018
 
 
+def test_a_flipped_bit_of_the_directory_of_an_archive_is_an_error_of_the_input_or_changes_nothing(
+    tmp_path: Path,
+) -> None:
+    content = write_library(tmp_path / "whole.sh3f", catalogue(MODELS[:1])).read_bytes()
+    path, first = tmp_path / "flipped.sh3f", content.index(b"PK\x01\x02")
+    refused = 0
+    for at in range(first, first + 46):
+        for bit in range(8):
+            path.write_bytes(content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :])
+            try:
+                assert len(load_libraries([path])[0].mesh.faces) == 12
+            except InputError:
+                refused += 1
+    assert refused > 100
+
+
 def test_names_in_another_language_are_warned_of(tmp_path: Path) -> None:
     known = write_library(tmp_path / "known.sh3f")
     foreign = write_library(tmp_path / "stuhl.sh3f", catalogue([("Stuhl", "Wohnzimmer", (50, 50, 90), {})]))
