@@ -10,12 +10,11 @@ names that agree where the encoder's name, too, is one that the segmenter has a 
 
 import argparse
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from errors import one_line_errors
-from furnished import names_of
+from furnished import classes_of_kinds, names_of
 from json_option import add_json_option, write_figures
 from segmenter import mosaic
 
@@ -27,17 +26,6 @@ from gsencoder.data.up import with_up
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.encode import Encoder
 from gsencoder.infer.relevancy import relevancy
-
-
-def classes_of_kinds(classes: Sequence[str]) -> np.ndarray:
-    """Which classes [C] name each kind [K]: by its name, a synonym or a broader word. "building" names no thing of a
-    room, but is a broader word for walls."""
-    return np.array(
-        [
-            [name in (*kind.words, *kind.hypernyms) and name != "building" for name in classes]
-            for kind in kinds().values()
-        ]
-    )
 
 
 def main() -> None:

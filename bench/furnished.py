@@ -61,6 +61,17 @@ def names_of(features: GaussianFeatures, words: TextTable) -> np.ndarray:
     return relevancy(features, words.encode(list(kinds())), words.mean).argmax(axis=0)
 
 
+def classes_of_kinds(classes: Sequence[str]) -> np.ndarray:
+    """Which classes [C] name each kind [K]: by its name, a synonym or a broader word. "building" names no thing of a
+    room, but is a broader word for walls."""
+    return np.array(
+        [
+            [name in (*kind.words, *kind.hypernyms) and name != "building" for name in classes]
+            for kind in kinds().values()
+        ]
+    )
+
+
 def found_boxes(
     scene: Scene, labels: LabeledSplat, names: Sequence[str], words: TextTable, absent: Sequence[str] = ()
 ) -> tuple[list[bool], list[bool]]:
@@ -113,7 +124,7 @@ def main() -> None:
     space = next(iter(encoder.tables))
     names = list(kinds())
     structure = np.array([name in STRUCTURE for name in names])
-    fits = np.array([[name in (kind.name, *kind.hypernyms) for kind in kinds().values()] for name in names])
+    fits = classes_of_kinds(names)
     table: dict[str, dict[str, list[float]]] = {each: defaultdict(list) for each in arguments.recolor or ["as it is"]}
     of_kind: dict[str, list[float]] = defaultdict(lambda: [0, 0])
     for number, (labels, codes, of_items) in enumerate(made_homes(models, arguments.seed, arguments.rooms)):
@@ -126,7 +137,7 @@ def main() -> None:
             predicted = names_of(features, words)
             right = predicted == codes
             rows["things"].append(float(right[thing].mean()) if thing.any() else np.nan)
-            rows["broader"].append(float(fits[predicted, codes][thing].mean()) if thing.any() else np.nan)
+            rows["broader"].append(float(fits[codes, predicted][thing].mean()) if thing.any() else np.nan)
             rows["structure"].append(float(right[structure[codes]].mean()))
             if title == "as it is":
                 for code in np.unique(codes[thing]):

@@ -18,9 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from agreement import classes_of_kinds
 from errors import one_line_errors, positive
-from furnished import VOXEL, names_of, summary
+from furnished import VOXEL, classes_of_kinds, names_of, summary
 from json_option import add_json_option, write_figures
 from segmenter import mosaic
 
