@@ -24,9 +24,9 @@ SLOTS = 160
 hundred steps learns these by heart, and nothing of things elsewhere."""
 STORED = 0.5
 """Share of storage rooms, in which things of all kinds are as frequent, among homes."""
-NOISE, DRIFT = (0.3, 3.5), 0.03
+NOISE, DRIFT = (0.3, 2.0), 0.03
 """Smallest and largest noise of the sensor, as in `WalkConfig`, and largest drift, metres: from clean meshes to seeds
-of a first depth camera's frames, whose walls are 2 cm thick (rms)."""
+of a first depth camera's frames, whose floors are 1 cm thick (rms in balls of 10 cm)."""
 MADE = 0.5
 """Share of makes of our own, of kinds of which there are such: from ten doors of a library no others are learned."""
 LEAST_VIEWS = 0.4

@@ -187,6 +187,7 @@ class Augmentation:
     tilt: float = 3.0  # standard deviation of the tilt of the up axis, degrees
     mirror: float = 0.5  # probability
     scale: float = 0.1  # largest relative change of size
+    bend: float = 0.03  # largest standard deviation of smooth shifts, as a share of their wavelength
     jitter: float = 0.1  # standard deviation of the shift of each center, voxels
     drop: float = 0.2  # largest share of Gaussians that is dropped at random
     light: float = 0.2  # largest relative change of brightness
@@ -228,6 +229,7 @@ def augment(
     shift = middle + rng.uniform(0, voxel, 3) + rng.normal(0, config.jitter * voxel, turned.means.shape)
     if config.lift:
         shift[:, 2] += voxel * (rng.uniform(-FAR, FAR) if rng.random() < config.lift else rng.normal(0, NEAR_FLOOR))
+    bent = turned.means + _smooth_shifts(turned.means, rng, rng.uniform(0, config.bend))
     # Colors are ½ + SH_C0·dc.
     gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
     black_shift = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
@@ -237,11 +239,28 @@ def augment(
     kept = 1 - rng.uniform(0, config.fade) * rng.random(len(turned.opacities))
     return replace(
         turned,
-        means=(turned.means + shift).astype(np.float32),
+        means=(bent + shift).astype(np.float32),
         sh=relit.astype(np.float32),
         scales=(turned.scales * np.exp(factors)).astype(np.float32),
         opacities=(turned.opacities * kept).astype(np.float32),
     )
+
+
+WAVES, SHORTEST_WAVE, LONGEST_WAVE = 12, 0.3, 2.0
+"""Number of waves that bend a sample, and their shortest and longest length, metres."""
+
+
+def _smooth_shifts(
+    means: Float32[np.ndarray, "N 3"], rng: np.random.Generator, amount: float
+) -> Float[np.ndarray, "N 3"]:
+    """Shifts by waves in random directions: depth sensors and poses are off by what changes slowly over a surface
+    (elastic distortion, Choy et al. 2019). Normals stay, as slopes are small."""
+    lengths = SHORTEST_WAVE * (LONGEST_WAVE / SHORTEST_WAVE) ** rng.random(WAVES)
+    directions = rng.normal(0, 1, (3, WAVES))
+    directions /= np.linalg.norm(directions, axis=0)
+    sizes = rng.normal(0, amount * math.sqrt(2 / WAVES), (WAVES, 3)) * lengths[:, None]
+    phases = (means @ (2 * math.pi * directions / lengths) + rng.uniform(0, 2 * math.pi, WAVES)).astype(np.float32)
+    return np.sin(phases) @ sizes.astype(np.float32)
 
 
 def _recolored(

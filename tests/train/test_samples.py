@@ -31,6 +31,7 @@ from gsencoder.train.samples import (
     SampleDataset,
     SamplingConfig,
     TrainingScene,
+    _smooth_shifts,
     augment,
     choose_crop,
     crop_size,
@@ -485,6 +486,23 @@ def test_a_share_of_the_samples_is_of_the_stream(dataset, monkeypatch):
     monkeypatch.setattr(module, "make_sample", lambda scene, *_: names.append(scene.name) or sample)
     assert all(data[number] is sample for number in range(400))
     assert names.count("made") / 400 == pytest.approx(0.8, abs=0.06)
+
+
+def test_a_bend_moves_neighbors_alike_and_places_far_apart_each_by_itself() -> None:
+    amount, one = 0.02, random_gaussians(4000, center=(0, 0, 0))
+    apart = np.array([0.003, 0.0, 0.0], np.float32)
+    moves = []
+    for seed in range(20):
+        shift = _smooth_shifts(np.concatenate([one.means, one.means + apart]), RNG(seed), amount)
+        first, second = np.split(shift, 2)
+        moves.append(first)
+        # The slopes of waves whose height is a share of their length have a standard deviation of 2π times that share.
+        slopes = np.linalg.norm(second - first, axis=1) / 0.003
+        assert slopes.max() < 6 * 2 * np.pi * amount
+    assert 0.005 < np.std(np.stack(moves)) < 0.04  # Waves are 30 cm to 2 m long.
+    bent = augment(one, RNG(0), replace(NOTHING, bend=amount), voxel=0.0)
+    assert np.ptp(bent.means - one.means, axis=0).min() > 1e-3
+    np.testing.assert_allclose(bent.quats, one.quats, atol=1e-6)
 
 
 def test_light_changes_brightness_and_black_stays_near_black() -> None:

@@ -203,7 +203,7 @@ class _Furnisher:
         groups: dict[RoomType, Sequence[Callable[[], object]]] = {
             "bedroom": (self._bed, self._bed_or_desk, partial(self._wall, "wardrobe")),
             "living room": (self._seats, self._dining, partial(self._wall, "bookshelf")),
-            "kitchen": (self._kitchen_row, self._dining),
+            "kitchen": (self._kitchen_rows, self._dining),
             "bathroom": tuple(partial(self._wall, kind) for kind in ("toilet", "sink", "bathtub")),
             "office": (self._desk, self._desk, self._desk, partial(self._wall, "bookshelf")),
             "corridor": (),
@@ -434,19 +434,25 @@ class _Furnisher:
                     if self._next_to(table, "chair", angle, gap, shift=shift, turn=turn, model=chair) is None:
                         self._next_to(table, "chair", angle, 0.03, shift=shift, model=chair)
 
-    def _kitchen_row(self) -> None:
+    def _kitchen_rows(self) -> None:
+        """Rows along one wall, or along two or three that meet, of one height and one make of cabinets."""
+        side, height, depth = int(self.rng.integers(4)), self.rng.uniform(0.82, 0.92), self.rng.uniform(0.55, 0.65)
+        low = self._draw("kitchen cabinet", _is_low)
+        high = self._draw("kitchen cabinet", lambda each: each.elevation > 0.8)
+        for number in range(int(self.rng.choice([1, 2, 3], p=[0.5, 0.35, 0.15]))):
+            self._kitchen_row((side + number) % 4, float(height), float(depth), low, high)
+
+    def _kitchen_row(self, side: int, height: float, depth: float, cabinet: Model | None, high: Model | None) -> None:
         """Cabinets, a stove, a sink and an oven along a wall, with a counter on them and cabinets above."""
-        side = int(self.rng.integers(4))
         first, last, along_x = self.room.side(side)
         at, end = first + 0.02, last - 0.02
-        height, depth = float(self.rng.uniform(0.82, 0.92)), float(self.rng.uniform(0.55, 0.65))
         runs: list[tuple[float, float]] = []
         start = at
         for kind in ("refrigerator", *self.rng.permutation(_KITCHEN_ROW).tolist()):
             low = kind != "refrigerator"
             if not low and self.rng.random() < 0.3:
                 continue
-            model = self._draw(kind, lambda each: each.elevation < 0.2 and each.size[2] > 0.5)
+            model = cabinet if kind == "kitchen cabinet" and self.rng.random() < 0.8 else self._draw(kind, _is_low)
             if model is None:
                 continue
             scale = np.array([1.0, depth / model.size[1] if low else 1.0, height / model.size[2] if low else 1.0])
@@ -469,12 +475,9 @@ class _Furnisher:
             box = Box(x - size[0] / 2, y - size[1] / 2, height, x + size[0] / 2, y + size[1] / 2, height + 0.035)
             self.supports.append((box, height + 0.036))
             where = begin
-            while where < finish - 0.3 and self.rng.random() < 0.9:
-                model = self._draw("kitchen cabinet", lambda each: each.elevation > 0.8)
-                if model is None or where + model.size[0] > finish + 0.05:
-                    break
-                self._wall("kitchen cabinet", at=(side, where + model.size[0] / 2), scale=np.ones(3), model=model)
-                where += model.size[0]
+            while high is not None and where + high.size[0] < finish + 0.05 and self.rng.random() < 0.85:
+                self._wall("kitchen cabinet", at=(side, where + high.size[0] / 2), scale=np.ones(3), model=high)
+                where += high.size[0]
 
     # Single and small things ---------------------------------------------------------------------------------------
 
@@ -501,14 +504,14 @@ class _Furnisher:
                 self._wall(name)
             else:
                 self._anywhere(name)
-        for _ in range(int(self.rng.integers(4))):
+        for _ in range(int(self.rng.integers(6))):
             self._picture()
         if self.rng.random() < 0.6:
             self._anywhere("ceiling light")
 
     def _picture(self) -> None:
         """A picture or a mirror of our own on a wall."""
-        side, size = int(self.rng.integers(4)), self.rng.uniform(0.25, 1.1, 2)
+        side, size = int(self.rng.integers(4)), 0.15 * (1.1 / 0.15) ** self.rng.random(2)
         first, last, along_x = self.room.side(side)
         if last - first < size[0] + 0.2:
             return
@@ -550,8 +553,8 @@ class _Furnisher:
     def _small_things(self) -> None:
         names, weights = self._weights(("surface",))
         for box, _ in list(self.supports) if names else ():
-            area = (box.x1 - box.x0) * (box.y1 - box.y0)
-            for name in self.rng.choice(names, int(self.rng.poisson(min(5.0, 4 * area))), p=weights).tolist():
+            mean = min(8.0, 3 * max(box.x1 - box.x0, box.y1 - box.y0))
+            for name in self.rng.choice(names, int(self.rng.poisson(mean)), p=weights).tolist():
                 self._on(box, name)
 
     # Openings and what encloses a room --------------------------------------------------------------------------
@@ -633,6 +636,11 @@ class _Furnisher:
         around = (("wall", walls), ("ceiling", ceiling)) if self.room.type != "storage room" else ()
         for kind, shape in (("floor", floor), *around):
             self.room.items.append(Item(kind=kind, matrix=identity, shape=shape, finish=kind))
+
+
+def _is_low(model: Model) -> bool:
+    """Whether a model stands on the floor and reaches about the height of a counter."""
+    return model.elevation < 0.2 and model.size[2] > 0.5
 
 
 def pose(x: float, y: float, z: float, yaw: float, scale: np.ndarray) -> Float64[np.ndarray, "3 4"]:

@@ -66,6 +66,9 @@ class Surfaces:
         )
         self._item_of = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(mesh.faces) for mesh in meshes])
         looks = [looks_of(item, mesh, rng) for item, mesh in zip(home.items, meshes, strict=True)]
+        # Chairs around a table, and cabinets of a kitchen, are one make and look alike.
+        of_model = {id(item.model): each for item, each in zip(home.items, looks, strict=True) if item.model}
+        looks = [of_model.get(id(item.model), each) for item, each in zip(home.items, looks, strict=True)]
         starts = np.cumsum([0, *(len(each) for each in looks)])
         self._look_of = np.concatenate([mesh.materials + start for mesh, start in zip(meshes, starts, strict=False)])
         self._uvs = np.concatenate([mesh.uvs for mesh in meshes])
@@ -151,6 +154,7 @@ _PALETTES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float
     "ceiling": ((0.0, 0.2), (0.0, 0.08), (0.75, 1.0)),
     "metal": ((0.5, 0.7), (0.0, 0.1), (0.3, 0.9)),
     "paint": ((0.0, 1.0), (0.0, 0.35), (0.3, 1.0)),
+    "lacquer": ((0.0, 1.0), (0.5, 1.0), (0.2, 0.9)),
 }
 _EXCHANGES = ("wood", "fabric", "stone", "metal")
 
@@ -205,7 +209,7 @@ def _finish(finish: str, rng: np.random.Generator) -> Look:
     if finish == "rug":
         return _blocks(rng, 0.7) if rng.random() < 0.6 else _noise(_color("fabric", rng), rng)
     if finish == "paint":
-        return _noise(_color("ceiling" if rng.random() < 0.5 else "paint", rng), rng)
+        return _noise(_color(str(rng.choice(["ceiling", "paint", "lacquer"], p=[0.45, 0.4, 0.15])), rng), rng)
     if finish == "picture":
         return _blocks(rng, float(rng.uniform(0.3, 1.0)))
     if finish == "mirror":

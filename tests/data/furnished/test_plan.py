@@ -83,6 +83,40 @@ def test_each_room_has_walls_floor_and_ceiling_and_what_its_type_needs(room: str
     assert np.mean(found) > 0.5
 
 
+def test_rows_of_a_kitchen_meet_in_corners_and_have_one_height_and_mostly_one_make(models: tuple[Model, ...]) -> None:
+    sides, same = [], []
+    for seed in range(30):
+        home = plan_home(models, np.random.default_rng(seed), ["kitchen"], made=1.0)
+        counters = [box_of_item(item) for item in home.items if item.kind == "counter"]
+        if not counters:
+            continue
+        assert np.ptp([box[1, 2] for box in counters]) < 1e-6
+        sides.append(len({bool(np.argmax((box[1] - box[0])[:2])) for box in counters}))
+        cabinets = [item for item in home.items if item.kind == "kitchen cabinet" and item.matrix[2, 3] == 0]
+        ids = [id(item.model) for item in cabinets]
+        same.append(max(map(ids.count, ids), default=0) / max(len(ids), 1))
+    assert len(sides) > 20
+    assert np.mean(np.equal(sides, 2)) > 0.2
+    assert np.mean(same) > 0.6
+
+
+def test_some_shelves_hang_on_walls_and_carry_things(tmp_path: Path) -> None:
+    from furniture import MODELS, catalogue
+
+    shelves = ("Shelves", "Living room", (80.0, 30.0, 90.0), dict[str, str]())
+    models, carried = load_libraries([write_library(tmp_path / "more.sh3f", catalogue([*MODELS, shelves]))]), 0
+    for seed in range(40):
+        home = plan_home(models, np.random.default_rng(seed), ["living room"], made=1.0)
+        boxes = [box_of_item(item) for item in home.items if item.kind == "shelf"]
+        carried += any(
+            abs(item.matrix[2, 3] - box[1, 2]) < 0.02 and (box[0, :2] <= item.matrix[:2, 3]).all()
+            for item in home.items
+            for box in boxes
+            if box[0, 2] > 0.9 and kinds()[item.kind].place == "surface"
+        )
+    assert carried >= 5
+
+
 def test_rooms_share_walls(models: tuple[Model, ...]) -> None:
     for seed in SEEDS:
         home = plan_home(models, np.random.default_rng(seed), ["living room", "bedroom", "kitchen"])

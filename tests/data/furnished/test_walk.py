@@ -12,7 +12,7 @@ from gsencoder.data.furnished import surfaces
 from gsencoder.data.furnished.kinds import STRUCTURE
 from gsencoder.data.furnished.library import Model, select_makes
 from gsencoder.data.furnished.plan import Home, Item, plan_home, pose
-from gsencoder.data.furnished.shapes import mesh_of_quads
+from gsencoder.data.furnished.shapes import Rectangle, mesh_of_quads, slab
 from gsencoder.data.furnished.surfaces import Look, Surfaces
 from gsencoder.data.furnished.walk import WalkConfig, _commonest, furnished_scene, furnished_splat, objects_of
 
@@ -112,6 +112,17 @@ def test_light_and_materials_are_drawn_for_each_home_and_a_seed_gives_the_same(h
     images = [np.stack(list(scene.views.images)) for scene in scenes]
     assert (images[0] == images[1]).all()
     assert np.abs(images[0].astype(int) - images[2]).mean() > 5
+
+
+def test_things_of_one_make_look_alike(models: tuple[Model, ...]) -> None:
+    chair = next(model for model in models if model.kind.name == "chair")
+    items = [Item(kind="chair", matrix=pose(x, 0.0, 0.0, 0.0, np.ones(3)), model=chair) for x in (0.0, 2.0)]
+    floor = Item(kind="floor", matrix=pose(0.0, 0.0, 0.0, 0.0, np.ones(3)), shape=slab(1.0, 1.0, 0.1), finish="floor")
+    home = Home(rooms=(("office", Rectangle(-3.0, -3.0, 3.0, 3.0), 2.5),), items=(*items, floor))
+    found = Surfaces(home, rng())
+    faces = np.arange(len(chair.mesh.faces))
+    colors = [found._albedo(faces + first, np.full((len(faces), 2), 0.3, np.float32)) for first in (0, len(faces))]
+    np.testing.assert_array_equal(*colors)
 
 
 def test_a_shadow_lies_behind_what_stands_before_a_lamp(home: Home) -> None:
