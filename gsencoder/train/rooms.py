@@ -6,7 +6,7 @@ of samples of a step: a process, or a data worker of it, makes the rooms of its 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +29,8 @@ NOISE, DRIFT = (0.3, 2.0), 0.03
 of a first depth camera's frames, whose floors are 1 cm thick (rms in balls of 10 cm)."""
 MADE = 0.5
 """Share of makes of our own, of kinds of which there are such: from ten doors of a library no others are learned."""
-LEAST_VIEWS = 0.4
-"""Smallest share of the views of a walk that sees most things: people scan a part of a room, or in haste."""
+LEAST_WALKED = 0.25
+"""Smallest part of a walk: people scan a part of a room."""
 DENSITIES, FINEST = (0.4, 1.1), 0.015
 """Smallest and largest distance of the seeds, in voxels of the encoder, and the smallest one in metres."""
 
@@ -157,10 +157,10 @@ class RoomStream:
         home = plan_home(self._models, rng, ("storage room",) if rng.random() < STORED else (), made=MADE)
         noise = NOISE[0] * (NOISE[1] / NOISE[0]) ** rng.random()
         walk = splat_walk(home, noise=noise, drift=float(rng.uniform(0, DRIFT)))
-        walk = replace(walk, views=max(1, round(walk.views * rng.uniform(LEAST_VIEWS, 1))))
         voxel = self._sampling.draw_voxel(self._voxel, rng)
         spacing = DENSITIES[0] * (DENSITIES[1] / DENSITIES[0]) ** rng.random() * voxel
-        splat = furnished_splat(home, walk, max(FINEST, spacing), rng)
+        walked = float(rng.uniform(LEAST_WALKED, 1))
+        splat = furnished_splat(home, walk, max(FINEST, spacing), rng, walked=walked)
         of_items = np.array([self._code_of[item.kind] for item in home.items], np.int32)
         return LabeledPart(
             name=name, splat=splat, codes_of_rows=of_items[splat.items], codebook=self._codebook, voxel=voxel

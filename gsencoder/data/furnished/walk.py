@@ -1,5 +1,6 @@
 """What a walk with a camera sees of a furnished home: frames with depth and labels, or a splat with labels."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,6 +20,8 @@ from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views
 
 CLEARANCE = 0.25
 """Smallest distance of the camera from a surface, metres."""
+_HIGHEST = (0.2, 0.8)
+"""Height of the highest point that a walk looks at, as a share of the room's: many scans end below the ceiling."""
 _GRAZING = 0.12
 """Cosine between ray and normal below which a sensor measures no depth."""
 _EXPOSURE = 0.1
@@ -62,7 +65,7 @@ class Frame(NamedTuple):
 
 def walk_cameras(home: Home, surfaces: Surfaces, config: WalkConfig, rng: np.random.Generator) -> Cameras:
     """Cameras of a walk through all rooms, at the height of eyes or hands, away from things."""
-    centers, targets = [], []
+    centers, targets, highest = [], [], rng.uniform(*_HIGHEST)
     floor = sum(area.size for _, area, _ in home.rooms)
     for _, area, height in home.rooms:
         count = max(3, round(config.views * area.size / floor))
@@ -74,7 +77,7 @@ def walk_cameras(home: Home, surfaces: Surfaces, config: WalkConfig, rng: np.ran
         if not len(places):
             places = np.array([[*candidates[0, 0, :2], min(height - 0.3, 2.0)]])
         centers.append(_tour(places))
-        targets.append(rng.uniform([area.x0, area.y0, 0.0], [area.x1, area.y1, 0.8 * height], places.shape))
+        targets.append(rng.uniform([area.x0, area.y0, 0.0], [area.x1, area.y1, highest * height], places.shape))
     path = np.concatenate(centers)
     forward = np.concatenate(targets) - path
     # Not straight up or down.
@@ -179,10 +182,13 @@ class LabeledSplat(NamedTuple):
         return flat_gaussians(self.means[rows], normals, colors, largest=self.voxel, measured=False)
 
 
-def furnished_splat(home: Home, config: WalkConfig, voxel: float, rng: np.random.Generator) -> LabeledSplat:
-    """A splat of what a walk sees, as seeds from depth, with labels."""
+def furnished_splat(
+    home: Home, config: WalkConfig, voxel: float, rng: np.random.Generator, *, walked: float = 1.0
+) -> LabeledSplat:
+    """A splat of what a walk, or the first part of it, sees, as seeds from depth, with labels."""
     surfaces = Surfaces(home, rng)
     cameras = walk_cameras(home, surfaces, config, rng)
+    cameras = cameras.select(slice(math.ceil(walked * len(cameras))))
     believed = drifted(cameras, config.drift, rng)
     grid = SurfaceGrid(voxel, np.zeros(3))
     keys = []

@@ -9,7 +9,6 @@ from furniture import write_library
 
 from gsencoder.app import main as cli
 from gsencoder.data.furnished import surfaces
-from gsencoder.data.furnished.kinds import STRUCTURE
 from gsencoder.data.furnished.library import Model, select_makes
 from gsencoder.data.furnished.plan import Home, Item, plan_home, pose
 from gsencoder.data.furnished.shapes import Rectangle, mesh_of_quads, slab
@@ -60,9 +59,24 @@ def test_without_noise_gaussians_lie_on_the_surfaces_that_most_of_their_pixels_s
         means = splat.means[splat.items == item]
         assert (means > objects[item].aabb_min - voxel).all()
         assert (means < objects[item].aabb_max + voxel).all()
-    assert {home.items[item].kind for item in np.unique(splat.items)} >= set(STRUCTURE)
+    assert {home.items[item].kind for item in np.unique(splat.items)} >= {"wall", "floor"}
     keys = 3 * np.array([2, 7, 2, 2, 8, 8]) + [0, 2, 1, 1, 2, 0]
     assert _commonest(keys, 3, np.array([7, 2, 8])).tolist() == [2, 1, 0]
+
+
+def test_the_first_part_of_a_walk_sees_a_part_of_what_the_whole_does(home: Home) -> None:
+    whole, half = (furnished_splat(home, SMALL, 0.05, rng(), walked=share) for share in (1.0, 0.5))
+    assert len(half.cameras) == len(whole.cameras) / 2
+    np.testing.assert_array_equal(half.cameras.centers, whole.cameras.centers[: len(half.cameras)])
+    assert 0.1 < len(half.means) / len(whole.means) < 0.9
+
+
+def test_some_walks_look_at_ceilings_and_some_end_below(home: Home) -> None:
+    _, _, height = home.rooms[0]
+    config = WalkConfig(views=12, width=48, noise=0.0, drift=0.0)
+    tops = [furnished_splat(home, config, 0.1, np.random.default_rng(seed)).means[:, 2].max() for seed in range(12)]
+    assert max(tops) > height - 0.05
+    assert min(tops) < height - 0.2
 
 
 def test_a_splat_of_a_drifting_walk_lies_where_its_poses_say(home: Home) -> None:
