@@ -71,7 +71,7 @@ def test_those_of_several_teachers_have_the_settings_of_their_experiment() -> No
             assert value == {**constants, **settings["train"]}[name], name
     assert settings["augment"]
     # These were added since, and turns had any angle.
-    later = {"recolor", "spread", "lift", "fade", "askew"}
+    later = {"recolor", "spread", "lift", "fade", "askew", "bend"}
     augmentation = {name: value for name, value in asdict(Augmentation(turn=180.0)).items() if name not in later}
     assert made_with["augment"] == augmentation
 
