@@ -229,7 +229,7 @@ def augment(
     shift = middle + rng.uniform(0, voxel, 3) + rng.normal(0, config.jitter * voxel, turned.means.shape)
     if config.lift:
         shift[:, 2] += voxel * (rng.uniform(-FAR, FAR) if rng.random() < config.lift else rng.normal(0, NEAR_FLOOR))
-    bent = turned.means + _smooth_shifts(turned.means, rng, rng.uniform(0, config.bend))
+    shift += _smooth_shifts(turned.means, rng, rng.uniform(0, config.bend))
     # Colors are ½ + SH_C0·dc.
     gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
     black_shift = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
@@ -239,7 +239,7 @@ def augment(
     kept = 1 - rng.uniform(0, config.fade) * rng.random(len(turned.opacities))
     return replace(
         turned,
-        means=(bent + shift).astype(np.float32),
+        means=(turned.means + shift).astype(np.float32),
         sh=relit.astype(np.float32),
         scales=(turned.scales * np.exp(factors)).astype(np.float32),
         opacities=(turned.opacities * kept).astype(np.float32),

@@ -437,10 +437,10 @@ class _Furnisher:
     def _kitchen_rows(self) -> None:
         """Rows along one wall, or along two or three that meet, of one height and one make of cabinets."""
         side, height, depth = int(self.rng.integers(4)), self.rng.uniform(0.82, 0.92), self.rng.uniform(0.55, 0.65)
-        low = self._draw("kitchen cabinet", _is_low)
+        cabinet = self._draw("kitchen cabinet", _is_low)
         high = self._draw("kitchen cabinet", lambda each: each.elevation > 0.8)
         for number in range(int(self.rng.choice([1, 2, 3], p=[0.5, 0.35, 0.15]))):
-            self._kitchen_row((side + number) % 4, float(height), float(depth), low, high)
+            self._kitchen_row((side + number) % 4, float(height), float(depth), cabinet, high)
 
     def _kitchen_row(self, side: int, height: float, depth: float, cabinet: Model | None, high: Model | None) -> None:
         """Cabinets, a stove, a sink and an oven along a wall, with a counter on them and cabinets above."""
