@@ -1,6 +1,6 @@
 """Whether budgets of encoding hold, and what choosing costs.
 
-    python bench/encode_budgets.py SCENE… [--errors 0.001,0.003,0.01] [--weights house_cpu] [--chunk 250000]
+    python bench/encode_budgets.py SCENE… [--errors 0.001,0.003,0.01] [--weights house] [--chunk 250000]
 
 A line for each scene and limit: the setting, the error that was predicted, its bound, the error on a tenth of the
 Gaussians, drawn after the choice, and over all of them; CPU seconds of choosing, of the encoding, and of preset=exact.
@@ -29,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--errors", default="0.001,0.003,0.01")
-    parser.add_argument("--weights", default="house_cpu")
+    parser.add_argument("--weights", default="house")
     parser.add_argument("--chunk", type=int, default=EncodeConfig().chunk)
     parser.add_argument("--out", type=Path, default=Path("encode_budgets.csv"))
     add_json_option(parser)

@@ -1,6 +1,6 @@
 """Memories of unseen rooms in one pass, against dense features of the same encoder and fused ones.
 
-    python bench/feed_forward.py ROOM … [--weights house_cpu] [--bank-rooms ROOM …]
+    python bench/feed_forward.py ROOM … [--weights house] [--bank-rooms ROOM …]
 
 An encoder predicts features of each room; its queries are their principal coordinates. They attend to a bank of the
 room's own views, which the labels teacher has looked at, so that it holds the names that are in the room; or to one of
@@ -28,8 +28,8 @@ from gsencoder.infer.encode import Encoder
 from gsencoder.memory.bank import MapStream, build_bank, principal_queries
 from gsencoder.memory.index import index_features
 from gsencoder.teachers.base import Teacher
-from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
+from gsencoder.text.vocabulary import words_of_table
 from gsencoder.train.memory import MemoryConfig, memory_training, prepare_memory, train_memory
 from gsencoder.types import FeatureMap, QueryMemory, Scene
 
@@ -50,14 +50,14 @@ def maps_of(scenes: list[tuple[Scene, Teacher]]) -> MapStream:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rooms", nargs="+", type=Path)
-    parser.add_argument("--weights", default="house_cpu")
+    parser.add_argument("--weights", default="house")
     parser.add_argument("--bank-rooms", nargs="*", default=[], type=Path)
     parser.add_argument("--optimize", action="store_true", help="also optimize a memory of each room")
     add_json_option(parser)
     arguments = parser.parse_args()
     encoder, labels = Encoder.load(arguments.weights), LabelsConfig()
-    words = words_of(labels)
     teacher_name = next(name for name, space in encoder.spaces.items() if space.teacher == "labels")
+    words = words_of_table(encoder.tables[teacher_name])
     others = [load_scene(path) for path in arguments.bank_rooms]
     shared_maps = maps_of([(scene, labels.build(scene, words)) for scene in others])
     results, seconds = defaultdict(list), defaultdict(list)

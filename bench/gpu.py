@@ -377,7 +377,7 @@ def onnx(setting: Setting) -> Iterator[Row]:
     from gsencoder.infer.onnx.runtime import OnnxNetwork, feed_of
     from gsencoder.infer.torch_network import TorchNetwork
 
-    network = TorchNetwork.load("house_cpu")
+    network = TorchNetwork.load("house")
     file = export_onnx(network.header, network.lower())
     feed = feed_of(surface(20_000), None, 0.02)
     given = []

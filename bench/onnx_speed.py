@@ -1,6 +1,6 @@
 """An exported encoder under onnxruntime against the same under torch: seconds, memory, and how soon the first answer.
 
-    python bench/onnx_speed.py MODEL.onnx SCENE [--weights house_cpu] [--sizes 20000,100000]
+    python bench/onnx_speed.py MODEL.onnx SCENE [--weights house] [--sizes 20000,100000]
 
 Each figure is of a process of its own, which reads the model, encodes the Gaussians that are nearest to the middle of
 the scene once, and then again and again; the two take turns. Seconds are the best of the later passes, memory is the
@@ -33,14 +33,14 @@ def measure(model: str, splat: str) -> dict[str, float]:
     encoder = Encoder.load(model, "cpu")
     # A file computes in what it was exported in.
     config = EncodeConfig(chunk=0, precision="auto" if model.endswith(".onnx") else "float32", device="cpu")
-    encoder.encode(gaussians, config)
+    encoder.encode_spaces(gaussians, config)
     # Linux counts a process's start in clock ticks since boot.
     ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
     cold = float(Path("/proc/uptime").read_text().split()[0]) - ticks / os.sysconf("SC_CLK_TCK")
     seconds = []
     for _ in range(PASSES):
         start = time.perf_counter()
-        encoder.encode(gaussians, config)
+        encoder.encode_spaces(gaussians, config)
         seconds.append(time.perf_counter() - start)
     return {"seconds": min(seconds), "peak": peak_memory_mb(), "cold": cold}
 
@@ -49,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("model")
     parser.add_argument("scene")
-    parser.add_argument("--weights", default="house_cpu")
+    parser.add_argument("--weights", default="house")
     parser.add_argument("--sizes", default="20000,100000")
     parser.add_argument("--child", action="store_true")
     add_json_option(parser)

@@ -1,6 +1,6 @@
 """Gathers the evidence for boxes in labeled rooms, to which `bench/presence.py` fits their probabilities.
 
-    python bench/presence_evidence.py HOUSE OUT --words names [--weights house_cpu --space labels] [--text minilm_l6]
+    python bench/presence_evidence.py HOUSE OUT --words names [--weights house --space labels] [--text minilm_l6]
 
 Every room is asked words: the names of all objects of the house (`names`), other words for some of them (`others`),
 phrases that describe them (`phrases`, those of `bench/house_phrases.csv`), or a list of names ("mug,banana"). Features

@@ -2,8 +2,8 @@
 
     python -m bench.readme_picture ../shared/scenes/house/train_041 --view 6
 
-The encoder that comes with gsencoder gives the features. It sees Gaussians that were seeded from RGB-D frames, and no
-photograph; the room is one of those that it was not trained on.
+`house`, one of the encoders that come with gsencoder, gives the features. It sees Gaussians that were seeded from RGB-D
+frames, and no photograph; the room is one of those that it was not trained on.
 """
 
 import argparse
@@ -29,8 +29,8 @@ def main() -> None:
     given = parser.parse_args()
 
     scene = with_gaussians(load_scene(given.scene))
-    encoder = Encoder.load("house_cpu")
-    features = encoder.encode(scene.gaussians)
+    encoder = Encoder.load("house")
+    features = encoder.encode(scene.gaussians, space="labels", up=scene.up)
     found = localize(replace(scene, features={features.space.name: features}), given.words.split(","), encoder.words)
 
     view, cameras = given.view, scene.views.cameras

@@ -37,7 +37,8 @@ REGISTRY = Path(__file__).with_name("figures.yaml")
 REPEATABLE = ("accuracy", "error", "count", "bytes", "memory")
 """Kinds of figures that do not depend on the load of the machine."""
 NEEDS = {"java": "java", "chromium": "chromium", "compiler": "gcc", "gpu": "nvidia-smi"}
-"""Programs that an entry may need, besides `shared`, the folder of shared data."""
+"""Programs that an entry may need, besides `shared`, the folder of shared data, and `furniture`, Debian's library."""
+FURNITURE = Path("/usr/share/sweethome3d/furniture")
 PATIENCE = 5
 """A command may take this multiple of its minutes."""
 
@@ -105,7 +106,7 @@ class Entry:
         section: heading of a page of results, or "README.md".
         command: bash; $S is the folder of shared data, $OUT an empty folder for what it writes.
         minutes: of one run on two quiet cores.
-        needs: "shared", or keys of NEEDS.
+        needs: "shared", "furniture", or keys of NEEDS.
         repeats: number of runs, for figures that spread.
     """
 
@@ -119,7 +120,8 @@ class Entry:
 
     def missing(self, shared: Path) -> str:
         """What it needs and is not here; empty if it can run."""
-        here = {"shared": (shared / "scenes").is_dir()} | {need: bool(shutil.which(NEEDS[need])) for need in NEEDS}
+        here = {"shared": (shared / "scenes").is_dir(), "furniture": FURNITURE.is_dir()}
+        here |= {need: bool(shutil.which(NEEDS[need])) for need in NEEDS}
         return ", ".join(need for need in self.needs if not here[need])
 
 
@@ -156,7 +158,7 @@ def load_registry(file: Path = REGISTRY) -> tuple[Entry, ...]:
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RegistryError(f"{file}: stands twice: {', '.join(twice)}")
     for entry in entries:
-        if unknown := set(entry.needs) - {"shared", *NEEDS}:
+        if unknown := set(entry.needs) - {"shared", "furniture", *NEEDS}:
             raise RegistryError(f"{file}: {entry.name}: unknown needs: {', '.join(sorted(unknown))}")
         if not entry.figures or entry.repeats < 1 or not entry.minutes > 0:
             raise RegistryError(f"{file}: {entry.name}: expected figures, repeats of 1 or more, and minutes above 0")

@@ -1,6 +1,6 @@
 """Selected Gaussians against the true ones of labeled rooms, and what is left of an object that was taken out.
 
-    python bench/selections.py ROOM … [--weights house_cpu] [--every 4] [--alone]
+    python bench/selections.py ROOM … [--weights house] [--every 4] [--alone]
     python bench/selections.py ROOM … --boxes [--splats FOLDER]
 
 Every n-th view of a room is left out; the others give seeds, and features of the labels teacher, and of an encoder.
@@ -52,7 +52,7 @@ from gsencoder.render import Blend, blend
 from gsencoder.render.images import render_image
 from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.text.vocabulary import Words
+from gsencoder.text.vocabulary import Words, words_of_table
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, SceneObject, Views
 
 MIN_WEIGHT = 1.0
@@ -201,7 +201,7 @@ def count_boxes(rooms: Sequence[Path], splats: Path | None) -> dict[str, dict[st
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rooms", nargs="+", type=Path)
-    parser.add_argument("--weights", default="house_cpu")
+    parser.add_argument("--weights", default="house")
     parser.add_argument("--every", type=int, default=4)
     parser.add_argument("--alone", action="store_true")
     parser.add_argument("--boxes", action="store_true")
@@ -214,6 +214,7 @@ def main() -> None:
         write_figures(arguments.json, count_boxes(arguments.rooms, arguments.splats))
         return
     words, encoder = words_of(LabelsConfig()), Encoder.load(arguments.weights)
+    space, table = next(iter(encoder.tables.items()))
     totals: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for path in arguments.rooms:
         start = time.perf_counter()
@@ -233,11 +234,14 @@ def main() -> None:
             totals["other views"]["weighted"].append(weighted)
         unit = unit_of(scene)
         sources = {
-            "fused": fuse(scene, LabelsConfig().build(scene, words)).features,
-            "encoded": encoder.encode(scene.gaussians, metres_per_unit=unit),
+            "fused": (fuse(scene, LabelsConfig().build(scene, words)).features, words),
+            "encoded": (
+                encoder.encode(scene.gaussians, space=space, metres_per_unit=unit, up=scene.up),
+                words_of_table(table),
+            ),
         }
-        for name, features in sources.items():
-            figures = score(scene, left_out, features, words, targets, truth, blends, alone=arguments.alone)
+        for name, (features, own) in sources.items():
+            figures = score(scene, left_out, features, own, targets, truth, blends, alone=arguments.alone)
             for key, values in figures.items():
                 totals[name][key] += values
             listing = ", ".join(f"{key} {np.mean(values):.3f}" for key, values in figures.items())

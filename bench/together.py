@@ -1,6 +1,6 @@
 """A segmenter of photographs, an encoder, and both together (`fuse encoder=`): how often each names a Gaussian rightly.
 
-    python bench/together.py WEIGHTS LIBRARIES [--homes 6] [--seed 3000] [--bias 0] [--json FILE]
+    python bench/together.py WEIGHTS LIBRARIES [--homes 6] [--seed 3000] [--bias 0.3] [--json FILE]
     python bench/together.py WEIGHTS $S/scenes/kitchen --regions bench/kitchen_regions.csv
 
 Made homes have held-out makes and photographs; the segmenter (teacher=mosaic text=minilm) is fused over these. With
@@ -33,7 +33,7 @@ from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.up import upright_gaussians, with_up
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.encode import Encoder
-from gsencoder.infer.ensemble import surer_features
+from gsencoder.infer.ensemble import BIAS, surer_features
 from gsencoder.types import Scene
 
 WIDTH = 512
@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("--regions", type=Path)
     parser.add_argument("--homes", type=positive, default=6)
     parser.add_argument("--seed", type=int, default=3000)
-    parser.add_argument("--bias", type=float, default=0.0)
+    parser.add_argument("--bias", type=float, default=BIAS)
     add_json_option(parser)
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)

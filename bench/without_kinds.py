@@ -1,7 +1,8 @@
 """Labeled scenes in which things of some kinds have no name, for encoders that are judged on kinds they never saw.
 
     python bench/without_kinds.py HOUSE OUT --kinds couch,desk [--names 'train_0[0-3]*']
-    gsencoder train OUT experiment=rooms rooms.libraries=LIBRARIES rooms.without=[couch,desk] holdout=[] out=fold
+    gsencoder train OUT experiment=rooms rooms.libraries=LIBRARIES rooms.without=[couch,desk] holdout=[] \
+        data.allow_outside=true out=fold
     python bench/furnished.py fold LIBRARIES --kinds couch,desk --boxes
 
 An object loses its name if this, or its last word, is one that kinds.csv has for these kinds (sofa, dining table). All

@@ -19,8 +19,8 @@ def main(folder: str, words: str) -> None:
     scene = load_scene(folder)
     scene = replace(scene, gaussians=scene.gaussians or seed(scene))
 
-    # The network sees means, rotations, scales, opacities and colors of the Gaussians, in metres.
-    encoder = Encoder.load("house_cpu")
+    # The network sees means and colors of the Gaussians, upright and in metres.
+    encoder = Encoder.load("rooms")
     features = encoder.encode(scene.gaussians, metres_per_unit=scene.metres_per_unit or 1.0, up=scene.up)
     print(f"{len(features):,} features of {features.space.describe()}")
 
@@ -41,7 +41,7 @@ def main(folder: str, words: str) -> None:
     Image.fromarray(np.hstack([picture, colors])).save("encoded.png")
 
     # A folder of features is what `gsencoder localize`, `views`, `ask` and `pack` take.
-    save_features("encoded", scene, features, {"encoder": "house_cpu"})
+    save_features("encoded", scene, features, {"encoder": "rooms"})
     save_splat("room.ply", scene.gaussians)
     print("encoded.png: view 0, and its features as colors; encoded: the features; room.ply: the splat alone")
 

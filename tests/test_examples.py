@@ -16,6 +16,7 @@ from PIL import Image
 
 import gsencoder
 from gsencoder.app import main as cli
+from gsencoder.core.errors import SceneWarning
 from gsencoder.data.synthetic import make_room, write_room
 
 pytestmark = pytest.mark.slow
@@ -71,11 +72,14 @@ def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(run, room, 
 
 
 def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(run, room, tmp_path):
-    out = run(3, room, "table,sofa")
+    # Six boxes and balls on a floor are no room that an encoder of rooms knows.
+    doubt = pytest.warns(SceneWarning, match="expects .*% of its names in this scene to be right, fewer than half")
+    with doubt, pytest.warns(SceneWarning, match=r"1 of 2 words have no box \('sofa'\)"):
+        out = run(3, room, "table,sofa")
     assert re.search(r"^[\d,]+ features of ", out)
     assert re.findall(r"^(table|sofa): \d+ boxes", out, re.MULTILINE) == ["table", "sofa"]
     features = gsencoder.load_features(tmp_path / "encoded").features
-    assert len(gsencoder.load_splat(tmp_path / "room.ply")) == len(features["labels-clip_vitb32"])
+    assert len(gsencoder.load_splat(tmp_path / "room.ply")) == len(features["labels-onnx:c5a1baf31b0ff687"])
     assert size_of(tmp_path / "encoded.png") == (240, 90)
 
 

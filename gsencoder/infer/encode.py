@@ -234,8 +234,9 @@ class Encoder:
         outputs, words = self.outputs[teacher], self.tables.get(teacher)
         if not outputs.confidence or words is None or not words.trained:
             return None
-        odds = name_odds(outputs, words.embeddings[[words.names.index(name) for name in words.trained]], restored)
-        return name_confidence(odds, scene_regions(means, self.voxel), outputs.confidence)
+        vectors = words.embeddings[[words.names.index(name) for name in words.trained]]
+        evidence = name_evidence(outputs, vectors, restored, scene_regions(means, self.voxel))
+        return name_confidence(evidence, outputs.confidence)
 
     def export(self, path: str | Path) -> None:
         """Writes the encoder as one ONNX file in float32, which runs without torch, after comparing the two."""
@@ -249,37 +250,55 @@ class Encoder:
 load_encoder = Encoder.load
 CONTRAST = 0.1
 """Temperature of the contrast that the encoder's names were trained with."""
+MANY_NAMES, MANY_GAUSSIANS = 2.0, 4.5
+"""Entropy of the names of a region, nats, and log10 of its Gaussians, from which on more says no more."""
 
 
-def name_odds(
-    outputs: OutputSpace, names: Float32[np.ndarray, "C D"], restored: Float32[np.ndarray, "N channels"]
-) -> Float32[np.ndarray, " N"]:
-    """The log-odds that the contrast of training gives the most probable of some names.
+def name_evidence(
+    outputs: OutputSpace,
+    names: Float32[np.ndarray, "C D"],
+    restored: Float32[np.ndarray, "N channels"],
+    regions: Int64[np.ndarray, " N"],
+) -> Float32[np.ndarray, "N 4"]:
+    """What speaks for the most probable of some names to be right: the log-odds that the contrast of training gives it,
+    and of the Gaussian's region the mean log-odds, the entropy of its names (at most `MANY_NAMES`) and log10 of the
+    number of its Gaussians (at most `MANY_GAUSSIANS`). An encoder is as sure of single Gaussians of a statue as of
+    those of a sofa, but calls terrain one name, and a hammer that stands alone is small for a room.
 
     Args:
         names: their vectors; those of synonyms are equal, and count once.
         restored: coordinates in the basis, or vectors, of Gaussians.
+        regions: from `scene_regions`.
     """
     vectors = np.unique(names, axis=0)
     codes = outputs.project(vectors)
-    odds = np.empty(len(restored), np.float32)
+    odds, name = np.empty(len(restored), np.float32), np.empty(len(restored), np.int64)
     for start in range(0, len(restored), NAME_ROWS):
         block = outputs.standardize(restored[start : start + NAME_ROWS])
         scores = (block @ codes.T - 0.5 * np.square(codes).sum(axis=1)) / (CONTRAST * codes.shape[1])
+        name[start : start + NAME_ROWS] = scores.argmax(axis=1)
         scores.sort(axis=1)
         others = np.log(np.exp(scores[:, :-1] - scores[:, -2:-1]).sum(axis=1)) + scores[:, -2]
         odds[start : start + NAME_ROWS] = scores[:, -1] - others
-    return odds
+    counts = np.maximum(np.bincount(regions), 1)
+    tally = np.bincount(regions * len(vectors) + name, minlength=len(counts) * len(vectors))
+    shares = tally.reshape(len(counts), -1) / counts[:, None]
+    entropy = -(shares * np.log(np.maximum(shares, 1e-12))).sum(axis=1)
+    of_regions = np.stack(
+        [
+            np.bincount(regions, odds) / counts,
+            np.minimum(entropy, MANY_NAMES),
+            np.minimum(np.log10(counts), MANY_GAUSSIANS),
+        ],
+        axis=1,
+    )
+    return np.concatenate([odds[:, None], of_regions[regions].astype(np.float32)], axis=1)
 
 
-def name_confidence(
-    odds: Float32[np.ndarray, " N"], regions: Int64[np.ndarray, " N"], coefficients: Sequence[float]
-) -> Float32[np.ndarray, " N"]:
-    """The probability that the most probable name of each Gaussian is right: a logistic model of its log-odds and of
-    their mean over its region, since an encoder is as sure of details of a statue as of those of a sofa."""
-    intercept, own, mean = coefficients
-    means = np.bincount(regions, odds) / np.maximum(np.bincount(regions), 1)
-    logits = intercept + own * odds + mean * means[regions]
+def name_confidence(evidence: Float32[np.ndarray, "N 4"], coefficients: Sequence[float]) -> Float32[np.ndarray, " N"]:
+    """The probability that the most probable name of each Gaussian is right: a logistic model of `name_evidence`, whose
+    intercept comes first."""
+    logits = coefficients[0] + evidence @ np.array(coefficients[1:], np.float32)
     return (0.5 * (1 + np.tanh(logits / 2))).astype(np.float32)
 
 

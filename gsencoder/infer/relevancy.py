@@ -310,7 +310,7 @@ class Cluster:
 
     Attributes:
         rows: its Gaussians, ascending.
-        score: mean relevancy, weighted by the Gaussians' weights, times the fourth root of `share`.
+        score: mean relevancy, weighted by the Gaussians' weights, times a small power of `share`.
         share: of its weight in that of all that was selected for the word.
     """
 
@@ -343,9 +343,10 @@ WITHOUT_RIVALS: Mapping[str, float] = MappingProxyType(
 """Coefficients where nothing is known but the word itself."""
 
 TRAINED: Mapping[str, float] = MappingProxyType(
-    {"intercept": -15.794, "mean": 15.848, "margin": 3.697, "prominence": 0.122, "size": 1.159, "share": 1.238}
+    {"intercept": -5.838, "mean": -0.335, "margin": 9.149, "prominence": 0.65, "size": 0.619, "share": 2.122}
 )
-"""Coefficients of words that the encoder of the features was trained on."""
+"""Coefficients of words that the encoder of the features was trained on. They were fitted to two encoders, whose right
+boxes have a mean of 0.82 and of 0.53: it does not tell right from wrong for both."""
 UNTRAINED: Mapping[str, float] = MappingProxyType(
     {"intercept": -7.858, "mean": 5.657, "margin": -1.032, "prominence": 0.507, "size": 0.747, "share": 1.083}
 )

@@ -50,8 +50,8 @@ class OutputSpace:
             raise InputError(f"OutputSpace.basis: expected {self.space.describe()}, got {self.basis.space.describe()}")
         if self.basis is not None and not self.centered:
             raise InputError("OutputSpace.centered: expected true with a basis, whose coordinates are about the mean")
-        if self.confidence and (len(self.confidence) != 3 or not all(map(math.isfinite, self.confidence))):
-            raise InputError(f"OutputSpace.confidence: expected no or three finite numbers, got {self.confidence}")
+        if self.confidence and (len(self.confidence) != 5 or not all(map(math.isfinite, self.confidence))):
+            raise InputError(f"OutputSpace.confidence: expected no or five finite numbers, got {self.confidence}")
 
     @property
     def channels(self) -> int:
@@ -242,7 +242,7 @@ def read_output_spaces(file: Archive) -> OutputSpaces:
 WEIGHTS_FILE = "encoder.safetensors"
 SHIPPED_WEIGHTS = Path(__file__).resolve().parent.parent / "weights"
 """Folder of the encoders that come with the package, one folder each."""
-DEFAULT_WEIGHTS = "house_cpu"
+DEFAULT_WEIGHTS = "rooms"
 """The one of them that is taken where none is named."""
 SHIPPED = "shipped:"
 """What a name of them begins with that cannot be taken for a path."""

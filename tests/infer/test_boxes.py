@@ -12,7 +12,15 @@ from scipy.spatial.transform import Rotation
 from splats import gaussians_at
 
 from gsencoder.data.seeding.points import scene_spacing
-from gsencoder.infer.localize import Extents, box_around, cluster, cluster_by_gaps, oriented_axes, score_clusters
+from gsencoder.infer.localize import (
+    SHARE_POWER,
+    Extents,
+    box_around,
+    cluster,
+    cluster_by_gaps,
+    oriented_axes,
+    score_clusters,
+)
 from gsencoder.types import Gaussians
 
 
@@ -80,13 +88,17 @@ def test_nothing_selected_has_no_clusters() -> None:
     assert score_clusters(empty, empty, empty.astype(np.float32), empty.astype(np.float32)) == []
 
 
-def test_floaters_are_dropped_by_their_share_of_the_best_clusters_weight() -> None:
+def test_floaters_are_dropped_by_their_share_of_the_heaviest_clusters_weight() -> None:
     labels = np.r_[np.zeros(96, int), np.ones(4, int)]
     scores, weights = np.full(100, 0.8, np.float32), np.ones(100, np.float32)
     rows = np.arange(100) + 7
     assert len(score_clusters(labels, rows, scores, weights)) == 2
     clusters = score_clusters(labels, rows, scores, weights, min_share=0.05)
     assert [one.rows.tolist() for one in clusters] == [list(range(7, 103))]
+    # A floater that is more relevant is one, too.
+    scores[96:] = 0.95
+    assert score_clusters(labels, rows, scores, weights)[0].rows.tolist() == [103, 104, 105, 106]
+    assert len(score_clusters(labels, rows, scores, weights, min_share=0.05)) == 1
 
 
 @given(
@@ -150,16 +162,16 @@ def test_sigma_boxes_bound_the_ellipsoids(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("mean", [0.5, 0.0, -0.5])
-def test_clusters_are_scored_by_their_weighted_mean_and_the_fourth_root_of_their_share(rng, mean):
-    """Of a negative mean the root is divided by: a small share is never an advantage."""
+def test_clusters_are_scored_by_their_weighted_mean_and_a_power_of_their_share(rng, mean):
+    """A negative mean is divided by the power: a small share is never an advantage."""
     labels, rows = rng.integers(-1, 4, 300), 10 + rng.permutation(300)
     scores, weights = (mean + rng.normal(0, 0.1, 300)).astype(np.float32), rng.random(300).astype(np.float32)
     expected = {}
     for label in range(4):
         own = labels == label
         average = np.average(scores[own].astype(float), weights=weights[own].astype(float))
-        root = (weights[own].sum(dtype=float) / weights.sum(dtype=float)) ** 0.25
-        expected[tuple(sorted(rows[own].tolist()))] = average * root if average >= 0 else average / root
+        power = (weights[own].sum(dtype=float) / weights.sum(dtype=float)) ** SHARE_POWER
+        expected[tuple(sorted(rows[own].tolist()))] = average * power if average >= 0 else average / power
     clusters = score_clusters(labels, rows, scores, weights)
     assert {tuple(one.rows.tolist()) for one in clusters} == set(expected)
     for one in clusters:

@@ -16,7 +16,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.folder import features_bytes, load_features, principal_axes, save_features
 from gsencoder.fusion.package import save_index_package, save_package
-from gsencoder.infer.encode import Encoder, name_confidence, name_odds
+from gsencoder.infer.encode import MANY_GAUSSIANS, MANY_NAMES, Encoder, name_confidence, name_evidence
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.onnx.runtime import from_metadata, to_metadata
 from gsencoder.infer.relevancy import expected_share
@@ -26,7 +26,7 @@ from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
 
-COEFFICIENTS = (0.3, 0.8, -0.2)
+COEFFICIENTS = (0.3, 0.8, -0.2, 0.5, 0.1)
 SPACE = FeatureSpace(name="six", channels=6, text_encoder="words-6")
 WORDS = TextTable(
     names=("mug", "plant", "chair"),
@@ -60,31 +60,60 @@ def test_odds_are_those_of_the_softmax_over_distances(basis, rng, monkeypatch):
     coordinates = (names - mean) @ components.T if basis else names
     squares = ((restored[:, None].astype(float) - coordinates[None]) ** 2).sum(axis=2) / outputs.unit**2
     logs = np.sort(log_softmax(-squares / (2 * outputs.channels * 0.1), axis=1), axis=1)
-    odds = name_odds(outputs, names, restored)
-    assert odds == pytest.approx(logs[:, -1] - logsumexp(logs[:, :-1], axis=1), abs=1e-4)
+    evidence = name_evidence(outputs, names, restored, np.zeros(40, np.int64))
+    assert evidence[:, 0] == pytest.approx(logs[:, -1] - logsumexp(logs[:, :-1], axis=1), abs=1e-4)
     # A synonym has the same vector, and is no rival.
-    assert np.array_equal(name_odds(outputs, np.concatenate([names, names[:2]]), restored), odds)
+    twice = name_evidence(outputs, np.concatenate([names, names[:2]]), restored, np.zeros(40, np.int64))
+    assert np.array_equal(twice, evidence)
 
 
 def test_a_feature_far_from_all_names_and_one_at_a_name_have_finite_odds() -> None:
     outputs = OutputSpace(space=SPACE, mean=np.zeros(6, np.float32), scale=1e-3)
     rows = np.array([WORDS.embeddings[0], np.full(6, 1e4), np.full(6, -1e4)], np.float32)
     with np.errstate(over="raise", invalid="raise"):
-        confidence = name_confidence(name_odds(outputs, WORDS.embeddings, rows), np.zeros(3, np.int64), COEFFICIENTS)
+        evidence = name_evidence(outputs, WORDS.embeddings, rows, np.zeros(3, np.int64))
+        confidence = name_confidence(evidence, COEFFICIENTS)
     assert np.isfinite(confidence).all()
     assert (confidence >= 0).all()
     assert (confidence <= 1).all()
 
 
-def test_confidence_in_a_region_does_not_depend_on_another(rng: np.random.Generator) -> None:
-    odds = rng.normal(size=50).astype(np.float32)
-    regions = np.arange(50) % 2
-    changed = np.where(regions == 1, odds + 5, odds).astype(np.float32)
-    before, after = (name_confidence(each, regions, COEFFICIENTS) for each in (odds, changed))
+def named(*names: int) -> tuple[OutputSpace, np.ndarray]:
+    """Features that are the vectors of names."""
+    return OutputSpace(space=SPACE, mean=np.zeros(6, np.float32), scale=1.0), np.eye(6, dtype=np.float32)[list(names)]
+
+
+def test_evidence_of_a_region_is_the_mean_of_its_odds_the_entropy_of_its_names_and_its_size() -> None:
+    outputs, rows = named(0, 1, 0, 1, 2, 2, 2, 2)
+    evidence = name_evidence(outputs, WORDS.embeddings, rows, np.array([0, 0, 0, 0, 1, 1, 1, 1]))
+    assert evidence[:, 1] == pytest.approx(np.repeat(evidence[:, 0].reshape(2, 4).mean(axis=1), 4))
+    assert evidence[:, 2] == pytest.approx([np.log(2)] * 4 + [0] * 4, abs=1e-6)
+    assert evidence[:, 3] == pytest.approx(np.log10(4))
+
+
+def test_evidence_of_large_regions_of_many_names_is_limited() -> None:
+    outputs = OutputSpace(space=SPACE, mean=np.zeros(6, np.float32), scale=1.0)
+    names = np.random.default_rng(0).normal(size=(100, 6)).astype(np.float32)
+    evidence = name_evidence(outputs, names, np.tile(names, (400, 1)), np.zeros(40_000, np.int64))
+    assert evidence[0, 2] == MANY_NAMES < np.log(100)
+    assert evidence[0, 3] == MANY_GAUSSIANS < np.log10(40_000)
+
+
+def test_evidence_of_a_region_does_not_depend_on_another(rng: np.random.Generator) -> None:
+    outputs = OutputSpace(space=SPACE, mean=np.zeros(6, np.float32), scale=1.0)
+    rows, regions = rng.normal(size=(50, 6)).astype(np.float32), np.arange(50) % 2
+    changed = np.where(regions[:, None] == 1, rows[::-1], rows)
+    before, after = (name_evidence(outputs, WORDS.embeddings, each, regions) for each in (rows, changed))
     assert np.array_equal(before[regions == 0], after[regions == 0])
-    assert not np.allclose(before[regions == 1], after[regions == 1])
-    alone = name_confidence(odds[regions == 0], np.zeros(25, np.int64), COEFFICIENTS)
+    assert not np.allclose(before[regions == 1, 1], after[regions == 1, 1])
+    alone = name_evidence(outputs, WORDS.embeddings, rows[regions == 0], np.zeros(25, np.int64))
     assert before[regions == 0] == pytest.approx(alone, abs=1e-6)
+
+
+def test_confidence_is_logistic_in_the_evidence() -> None:
+    evidence = np.array([[1, 2, 0.5, 4], [0, 0, 0, 0]], np.float32)
+    logits = np.array([0.3 + 0.8 - 0.4 + 0.25 + 0.4, 0.3])
+    assert name_confidence(evidence, COEFFICIENTS) == pytest.approx(1 / (1 + np.exp(-logits)))
 
 
 def test_an_encoder_states_confidence_if_its_weights_do(weights: Path, confident: Path) -> None:
@@ -97,8 +126,8 @@ def test_an_encoder_states_confidence_if_its_weights_do(weights: Path, confident
     encoder = Encoder.load(str(confident))
     # Chair is a word that it was not trained on.
     trained = encoder.tables["labels"].embeddings[:2]
-    odds = name_odds(encoder.outputs["labels"], trained, stated.features)
-    assert stated.confidence == pytest.approx(name_confidence(odds, np.zeros(300, np.int64), COEFFICIENTS))
+    evidence = name_evidence(encoder.outputs["labels"], trained, stated.features, np.zeros(300, np.int64))
+    assert stated.confidence == pytest.approx(name_confidence(evidence, COEFFICIENTS))
     rooms = [replace(each := random_gaussians(1000, seed), means=each.means + np.float32(99 * seed)) for seed in (0, 1)]
     alone = [encoder.encode(room).confidence for room in rooms]
     assert encoder.encode(merged(*rooms)).confidence == pytest.approx(np.concatenate(alone), abs=1e-5)
@@ -109,9 +138,9 @@ def test_a_graph_carries_the_coefficients(confident: Path) -> None:
     assert from_metadata(to_metadata(header)).outputs["labels"].confidence == COEFFICIENTS
 
 
-@pytest.mark.parametrize("wrong", [(1.0,), (1.0, 2.0, np.nan)])
+@pytest.mark.parametrize("wrong", [(1.0, 2.0, 3.0), (1.0, 2.0, 3.0, 4.0, np.nan)])
 def test_wrong_coefficients_are_refused(wrong: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match="three finite numbers"):
+    with pytest.raises(InputError, match="five finite numbers"):
         OutputSpace(space=SPACE, mean=np.zeros(6, np.float32), scale=1.0, confidence=wrong)
 
 
@@ -155,14 +184,23 @@ def two_things(confidence: float | None) -> Scene:
     return Scene(name="s", gaussians=replace(gaussians, means=means), features={"six": features})
 
 
-def test_boxes_are_as_probable_as_the_names_of_their_gaussians() -> None:
+@pytest.mark.parametrize("confidence", [0.0, 0.125, 0.25])
+def test_boxes_are_less_probable_where_fewer_than_half_of_the_names_are_expected_to_be_right(confidence: float) -> None:
     config = LocalizeConfig(min_probability=0.0)
-    plain, doubtful = (localize(two_things(each), ["mug", "plant"], WORDS, config) for each in (None, 0.25))
+    plain, doubtful = (localize(two_things(each), ["mug", "plant"], WORDS, config) for each in (None, confidence))
     by_word = {box.query: box.probability for box in doubtful.boxes if box.rank == 0}
     before = {box.query: box.probability for box in plain.boxes if box.rank == 0}
-    assert by_word["mug"] == pytest.approx(0.25 * before["mug"])
-    assert by_word["plant"] == pytest.approx(before["plant"])
+    (features,) = two_things(confidence).features.values()
+    assert features.confidence is not None
+    assert by_word["mug"] == pytest.approx(2 * features.confidence[:60].mean() * before["mug"])
+    assert by_word["plant"] == before["plant"]
     assert doubtful.probabilities[0] == pytest.approx(by_word["mug"])
+
+
+def test_boxes_where_half_of_the_names_are_expected_to_be_right_are_as_probable_as_without_doubt() -> None:
+    config = LocalizeConfig(min_probability=0.0)
+    plain, doubtful = (localize(two_things(each), ["mug", "plant"], WORDS, config) for each in (None, 0.6))
+    assert [box.probability for box in doubtful.boxes] == [box.probability for box in plain.boxes]
 
 
 def test_a_scene_of_which_less_than_half_is_expected_to_be_right_is_warned_of() -> None:

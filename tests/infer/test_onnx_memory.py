@@ -71,6 +71,6 @@ def test_the_command_writes_the_memory_of_one_space(tmp_path: Path, capsys: pyte
     session = onnxruntime.InferenceSession(str(tmp_path / "m.onnx"), providers=["CPUExecutionProvider"])
     (features,) = session.run(None, {"queries": one.queries[:5]})
     np.testing.assert_allclose(features, one.attend(one.queries[:5]), rtol=1e-2, atol=1e-2)
-    assert cli.main([*words, "weights=house_cpu", f"out={tmp_path / 'n.onnx'}"]) == 2
+    assert cli.main([*words, "weights=rooms", f"out={tmp_path / 'n.onnx'}"]) == 2
     assert "memory, weights: expected one of the two" in capsys.readouterr().err
     assert not (tmp_path / "n.onnx").exists()

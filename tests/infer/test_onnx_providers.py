@@ -60,7 +60,7 @@ def test_an_exporter_that_is_too_old_is_named_and_a_fault_of_a_newer_one_is_not_
     def fails(*_: Any, **__: Any) -> None:
         raise AssertionError("should have been constant, but got u2 - 1")
 
-    network = TorchNetwork.load("house_cpu")
+    network = TorchNetwork.load("rooms")
     monkeypatch.setattr(torch.export, "export", fails)
     with pytest.raises(AssertionError, match="should have been"):
         network.lower()

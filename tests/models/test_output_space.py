@@ -77,7 +77,7 @@ def two_spaces() -> OutputSpaces:
     other = FeatureSpace(name="t", channels=5)
     components = np.linalg.qr(np.random.default_rng(1).normal(size=(5, 2)))[0].T.astype(np.float32)
     basis = FeatureBasis(mean=np.arange(5, dtype=np.float32), components=components, energy_kept=0.9, space=other)
-    second = OutputSpace(space=other, mean=basis.mean, scale=3.0, basis=basis, confidence=(0.1, 0.2, 0.3))
+    second = OutputSpace(space=other, mean=basis.mean, scale=3.0, basis=basis, confidence=(0.1, 0.2, 0.3, 0.4, 0.5))
     return OutputSpaces(by_teacher={"first": space(), "second": second})
 
 
@@ -114,7 +114,7 @@ def test_a_file_restores_several_spaces_in_their_order(tmp_path: Path) -> None:
     values = np.random.default_rng(3).normal(size=(4, 8)).astype(np.float32)
     np.testing.assert_array_equal(again.restore(values), spaces.restore(values))
     assert again["second"].basis is not None
-    assert (again["first"].confidence, again["second"].confidence) == ((), (0.1, 0.2, 0.3))
+    assert (again["first"].confidence, again["second"].confidence) == ((), (0.1, 0.2, 0.3, 0.4, 0.5))
     assert (again["first"].space, again["second"].space) == (spaces["first"].space, spaces["second"].space)
 
 

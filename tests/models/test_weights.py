@@ -14,6 +14,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer.encode import Encoder
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs, load_weights, save_weights, start_from
 from gsencoder.models.output_space import DEFAULT_WEIGHTS, SHIPPED_WEIGHTS, OutputSpace, OutputSpaces, find_weights
+from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, Gaussians
 
 SPACE = FeatureSpace(name="s", channels=6, teacher="labels", text_encoder="t")
@@ -126,7 +127,7 @@ def test_a_name_of_shipped_weights_that_is_a_folder_too_is_refused_and_both_have
     shipped = SHIPPED_WEIGHTS / "house" / "encoder.safetensors"
     for name in ("house", "shipped:house"):
         assert find_weights(name) == shipped
-    for name in ("", "shipped:house_cpu", "house_cpu"):
+    for name in ("", "shipped:rooms", "rooms"):
         assert find_weights(name) == SHIPPED_WEIGHTS / DEFAULT_WEIGHTS / "encoder.safetensors"
     # Whether or not the folder of that name has an encoder.
     for make in (
@@ -138,17 +139,17 @@ def test_a_name_of_shipped_weights_that_is_a_folder_too_is_refused_and_both_have
             find_weights("house")
         assert find_weights("shipped:house") == shipped
     assert find_weights("./house") == Path("house/encoder.safetensors")
-    Path("house_cpu").mkdir()
+    Path("rooms").mkdir()
     assert find_weights("") == SHIPPED_WEIGHTS / DEFAULT_WEIGHTS / "encoder.safetensors"
 
 
 def test_words_of_another_encoder_beside_the_weights_are_refused(tmp_path: Path) -> None:
     for name in ("encoder.safetensors", "words.safetensors"):
-        shutil.copyfile(SHIPPED_WEIGHTS / "house_cpu" / name, tmp_path / name)
+        shutil.copyfile(SHIPPED_WEIGHTS / "rooms" / name, tmp_path / name)
     assert Encoder.load(str(tmp_path)).words is not None
-    shutil.copyfile(SHIPPED_WEIGHTS / "house" / "words.labels.safetensors", tmp_path / "words.safetensors")
+    save_text_table(tmp_path / "words.safetensors", make_text_table(["mug"], np.eye(1, 512, dtype=np.float32), "clip"))
     with pytest.raises(
-        InputError, match=r"words next to the encoder are of .* \(384 channels\), and its space labels has 512"
+        InputError, match=r"words next to the encoder are of .* \(512 channels\), and its space labels has 384"
     ):
         Encoder.load(str(tmp_path))
 

@@ -11,7 +11,7 @@ from stability.of_network import few
 from stability.registry import routine
 
 from gsencoder.infer import localize as clusters_module
-from gsencoder.infer.localize import cluster, score_clusters
+from gsencoder.infer.localize import SHARE_POWER, cluster, score_clusters
 from gsencoder.infer.relevancy import (
     NOISE,
     SMALLEST_SPREAD,
@@ -104,7 +104,7 @@ def cluster_scores_error(case: Case) -> float:
     for each in score_clusters(labels, rows, scores, weights):
         heft = weights[each.rows].astype(Wide)
         mean = (scores[each.rows] * heft).sum() / heft.sum()
-        damping = (heft.sum() / weights.astype(Wide).sum()) ** Wide("0.25")
+        damping = (heft.sum() / weights.astype(Wide).sum()) ** Wide(str(SHARE_POWER))
         want = mean * damping if mean >= 0 else mean / damping
         errors.append(float(abs(each.score - want) / max(np.abs(scores).max(), abs(want))))
     return max(errors)

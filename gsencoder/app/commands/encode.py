@@ -47,7 +47,7 @@ class EncodeCommandConfig(SharedScenesConfig):
     weights: str = option(
         "",
         "folder or file written by `train` or `export`, or the name of an encoder that comes with "
-        "gsencoder; empty = house_cpu, which does",
+        "gsencoder; empty = rooms, which does",
     )
     spaces: tuple[str, ...] = option(
         (), "teachers whose features are written, of an encoder with several; empty = all of them", names=True

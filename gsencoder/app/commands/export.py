@@ -36,7 +36,7 @@ class ExportConfig(CommonConfig):
     weights: str = option(
         "",
         "folder or file written by `train`, or the name of an encoder that comes with gsencoder; empty = "
-        "house_cpu, which does",
+        "rooms, which does",
     )
     memory: str = option(
         "", "folder written by `memory`, whose attention is exported, from queries to features, in place of an encoder"

@@ -288,7 +288,7 @@ class EncoderSettings(CheckedConfig):
         patch: largest number of tokens of a patch.
     """
 
-    weights: str = "shipped:house_cpu"
+    weights: str = "shipped:rooms"
     graph: Graph = "none"
     voxel: float = option(0.0, "edge of the token grid, metres", ge=0)
     patch: int = option(0, "largest number of tokens of a patch", ge=0)
@@ -296,7 +296,7 @@ class EncoderSettings(CheckedConfig):
 
 
 ENCODER_KNOBS = (
-    Knob(name="weights", key="weights", values=("shipped:house_cpu", "shipped:house")),
+    Knob(name="weights", key="weights", values=("shipped:rooms", "shipped:house")),
     Knob(name="graph", key="graph", values=("float32", "int8_weights", "int8_dynamic"), exact="none"),
     Knob(name="precision", key="encode.precision", values=("float32", "bfloat16"), exact="float32"),
     Knob(name="voxel", key="voxel", values=(0.015, 0.03, 0.04), exact=0.0),
