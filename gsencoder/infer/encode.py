@@ -24,7 +24,6 @@ from gsencoder.core.threads import ahead
 from gsencoder.data.up import scaled, upright_gaussians
 from gsencoder.fusion.basis import field_error
 from gsencoder.infer.onnx.runtime import SUFFIX, Network, OnnxNetwork
-from gsencoder.infer.segments import LAST_CELL, SEGMENT_CELL, average_within, cell_keys, surface_segments
 from gsencoder.models.grid import cut_scene_curves
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, find_weights
 from gsencoder.text.table import TextTable
@@ -39,6 +38,8 @@ REGION_CELL = 256
 of attention on a surface is 180 voxels wide at their coarsest level, so no context lies beyond a gap of 256."""
 LEAST_REGION = 1_000
 """Gaussians of a region that is encoded by itself; smaller ones are strays, and are encoded together."""
+LAST_CELL = 2**20
+"""Further cells along an axis count as this one, so that three numbers of cells fit into one integer."""
 NAME_ROWS = 16_384
 """Gaussians whose names are compared at a time."""
 TOLERANCE = 1e-4
@@ -63,13 +64,6 @@ class EncodeConfig(CheckedConfig):
     device: Device = option("auto", "where the encoder computes")
     grids: tuple[float, ...] = option(
         (), "edges of token grids, metres, whose outputs are averaged; empty = those of the weights", gt=0, lt=math.inf
-    )
-    segments: float = option(
-        0.0,
-        "share, 0 to 1, of the mean over its segment of surface (of one direction and color) in the output of a "
-        "Gaussian; 0.5 names large things better and still tells small ones from what they stand on",
-        ge=0,
-        le=1,
     )
 
 
@@ -184,10 +178,6 @@ class Encoder:
         if len(grids) > 1:
             for each in values.values():
                 each /= len(grids)
-        if config.segments:
-            segments = surface_segments(gaussians, SEGMENT_CELL)
-            for each in values.values():
-                average_within(segments, each, config.segments)
         return {
             teacher: self.outputs[teacher].features(each, self._confidence(teacher, each, gaussians.means))
             for teacher, each in values.items()
@@ -344,7 +334,11 @@ def scene_regions(means: Float32[np.ndarray, "N 3"], voxel: float) -> Int64[np.n
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    keys = cell_keys(means, REGION_CELL * voxel)
+    # Borders lie at multiples of the edge in the world, so that a cell is the same whatever else there is.
+    keys = np.zeros(len(means), np.int64)
+    for column in means.T:
+        cells = np.floor(column.astype(np.float64) / (REGION_CELL * voxel))
+        keys = keys * (LAST_CELL + 1) + np.minimum(cells - cells.min(), LAST_CELL).astype(np.int64)
     occupied = np.unique(keys)
     tree = cKDTree(np.stack(np.unravel_index(occupied, (LAST_CELL + 1,) * 3), axis=1))
     pairs = tree.query_pairs(1.5, p=np.inf, output_type="ndarray")

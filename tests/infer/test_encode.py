@@ -15,7 +15,6 @@ from training_scenes import SMALL
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer import encode as module
 from gsencoder.infer.encode import EncodeConfig, Encoder, cut, scene_regions
-from gsencoder.infer.segments import SEGMENT_CELL, surface_segments
 from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
@@ -159,21 +158,6 @@ def test_features_on_several_grids_are_the_mean_of_those_on_each() -> None:
     in_feet = replace(scene, means=scene.means / np.float32(0.25), scales=scene.scales / np.float32(0.25))
     there = encode(in_feet, network, WHOLE, metres_per_unit=0.25).decode()
     np.testing.assert_allclose(there, np.mean(each, axis=0), atol=1e-5)
-
-
-def test_features_in_segments_are_the_mean_over_them_in_any_unit() -> None:
-    network, scene = encoder(), random_gaussians(400, seed=2)
-    plain = encode(scene, network, WHOLE).decode()
-    segments = surface_segments(scene, SEGMENT_CELL)
-    assert 1 < segments.max() < len(scene) - 1
-    means = np.stack([plain[segments == number].mean(axis=0) for number in range(segments.max() + 1)])
-    half = encode(scene, network, replace(WHOLE, segments=0.5)).decode()
-    np.testing.assert_allclose(half, (plain + means[segments]) / 2, atol=1e-4)
-    averaged = replace(WHOLE, segments=1.0)
-    np.testing.assert_allclose(encode(scene, network, averaged).decode(), means[segments], atol=1e-4)
-    in_feet = replace(scene, means=scene.means / np.float32(0.25), scales=scene.scales / np.float32(0.25))
-    there = encode(in_feet, network, averaged, metres_per_unit=0.25).decode()
-    np.testing.assert_allclose(there, means[segments], atol=1e-4)
 
 
 def seen_by(scene: Gaussians, config: EncodeConfig = WHOLE, unit: float = 1.0, **up: np.ndarray) -> list[Gaussians]:
