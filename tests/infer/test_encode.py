@@ -249,6 +249,12 @@ def test_rooms_that_are_far_apart_have_the_bits_that_each_has_alone(chunk: int) 
         assert np.array_equal(features[part_of == number], encode(part, network, config).features)
 
 
+def test_places_that_are_thousands_of_cells_away_are_regions_of_their_own() -> None:
+    cloud = random_gaussians(2000, seed=2).means * np.float32(0.1)
+    means = np.concatenate([cloud + np.float32(256 * away) * np.float32([1, 0, 0]) for away in (0, 2000, 5000)])
+    assert scene_regions(means, 1.0).tolist() == np.repeat([0, 1, 2], 2000).tolist()
+
+
 def test_what_is_one_region_is_encoded_as_it_is() -> None:
     """A room, one Gaussian, all at one place, a line as long as the world, and small regions however far apart."""
     line = random_gaussians(2000)

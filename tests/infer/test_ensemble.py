@@ -66,6 +66,20 @@ def test_with_a_bias_the_encoder_is_taken_more_often() -> None:
     assert (shares[0], shares[-1]) == (0, 1)
 
 
+def test_an_encoder_of_somewhat_smaller_cosines_counts_as_surer() -> None:
+    """Features that lie between a name and what is across all names, with cosines of 0.7 and of 0.3 to 0.5."""
+    across = np.linalg.svd(NAMES - MEAN)[2][-1]
+    direction = (NAMES[0] - MEAN) / np.linalg.norm(NAMES[0] - MEAN)
+
+    def between(cosines: list[float]) -> np.ndarray:
+        parts = np.array(cosines)[:, None]
+        return (MEAN + parts * direction + np.sqrt(1 - parts**2) * across).astype(np.float32)
+
+    teacher = features(between([0.7, 0.7, 0.7]), "teacher")
+    _, by_encoder = surer_features(teacher, features(between([0.3, 0.35, 0.5]), "encoder"), NAMES, MEAN)
+    assert by_encoder.tolist() == [False, False, True]
+
+
 def test_words_of_another_text_encoder_are_refused() -> None:
     one = features(NAMES, "teacher")
     space = FeatureSpace(name="labels", channels=16, teacher="labels", text_encoder="others")
