@@ -18,12 +18,11 @@ from pathlib import Path
 
 import numpy as np
 from errors import existing_folder, one_line_errors, output_folder, positive
-from furnished import VOXEL, made_homes, names_of
+from furnished import VOXEL, kinds_of, made_homes, names_of
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.data.furnished.kinds import kinds
 from gsencoder.data.furnished.library import Model, load_libraries, select_makes
 from gsencoder.data.furnished.plan import plan_home
 from gsencoder.data.furnished.walk import furnished_splat, splat_walk
@@ -69,9 +68,8 @@ def rough_home(models: Sequence[Model], seed: int) -> tuple[Gaussians, np.ndarra
     home = plan_home(models, rng)
     walk = splat_walk(home, noise=rng.uniform(1, ROUGHEST))
     labels = furnished_splat(home, walk, VOXEL, rng, walked=rng.uniform(LEAST_WALKED, 1))
-    every = list(kinds())
-    codes = np.array([every.index(item.kind) for item in home.items])[labels.items]
-    return augment(labels.gaussians(), rng, Augmentation(lift=0.0, recolor=0.6), voxel=0.03), codes
+    rough = augment(labels.gaussians(), rng, Augmentation(lift=0.0, recolor=0.6), voxel=0.03)
+    return rough, kinds_of(labels, home)
 
 
 def gather(arguments: argparse.Namespace, encoder: Encoder) -> Iterator[tuple[str, Path]]:

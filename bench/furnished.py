@@ -26,7 +26,7 @@ from errors import comma_separated, one_line_errors, positive
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.furnished.kinds import STRUCTURE, kinds
 from gsencoder.data.furnished.library import Model, held_out_models, load_libraries, select_makes
-from gsencoder.data.furnished.plan import plan_home
+from gsencoder.data.furnished.plan import Home, plan_home
 from gsencoder.data.furnished.walk import LabeledSplat, furnished_splat, splat_walk
 from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.infer.encode import Encoder
@@ -52,8 +52,13 @@ def made_homes(models: Sequence[Model], seed: int, count: int) -> Iterator[tuple
         rng = np.random.default_rng([seed, number])
         home = plan_home(models, rng)
         labels = furnished_splat(home, splat_walk(home), VOXEL, rng)
-        of_items = [item.kind for item in home.items]
-        yield labels, np.array([list(kinds()).index(kind) for kind in of_items])[labels.items], of_items
+        yield labels, kinds_of(labels, home), [item.kind for item in home.items]
+
+
+def kinds_of(labels: LabeledSplat, home: Home) -> np.ndarray:
+    """The number of the kind of each Gaussian."""
+    every = list(kinds())
+    return np.array([every.index(item.kind) for item in home.items])[labels.items]
 
 
 def names_of(features: GaussianFeatures, words: TextTable) -> np.ndarray:

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from errors import one_line_errors, positive
-from furnished import VOXEL, classes_of_kinds, names_of, summary
+from furnished import VOXEL, classes_of_kinds, kinds_of, names_of, summary
 from json_option import add_json_option, write_figures
 from segmenter import mosaic
 
@@ -42,15 +42,14 @@ WIDTH = 512
 
 def homes(libraries: Path, seed: int, count: int) -> Iterator[tuple[Scene, np.ndarray]]:
     """Homes of held-out makes with photographs, and the kind of each Gaussian."""
-    models, every = select_makes(load_libraries([libraries]), "held_out"), list(kinds())
+    models = select_makes(load_libraries([libraries]), "held_out")
     for number in range(count):
         home = plan_home(models, np.random.default_rng([seed, number]))
         # Without drift both draw the same cameras and materials.
         walk = replace(splat_walk(home, drift=0.0), width=WIDTH)
         scene = furnished_scene(home, f"home {number}", walk, np.random.default_rng([seed, number, 1]))
         labels = furnished_splat(home, walk, VOXEL, np.random.default_rng([seed, number, 1]))
-        of_items = np.array([every.index(item.kind) for item in home.items])
-        yield replace(scene, gaussians=labels.gaussians()), of_items[labels.items]
+        yield replace(scene, gaussians=labels.gaussians()), kinds_of(labels, home)
 
 
 def regions(path: Path, table: Path) -> Iterator[tuple[Scene, np.ndarray]]:

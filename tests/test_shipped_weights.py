@@ -36,7 +36,7 @@ TRAINED = {"rooms": 698, "house": 63}
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_they_are_small_and_say_how_they_were_made(name: str) -> None:
     folder = SHIPPED_WEIGHTS / name
-    assert sum(path.stat().st_size for path in folder.iterdir()) < 25e6
+    assert sum(path.stat().st_size for path in folder.iterdir()) < (25e6 if name == "rooms" else 14e6)
     _, outputs, made_by = load_weights(name)
     assert list(outputs) == WEIGHTS[name]
     tables = load_tables(folder, outputs)
@@ -44,7 +44,7 @@ def test_they_are_small_and_say_how_they_were_made(name: str) -> None:
     words = tables["labels"]
     assert outputs["labels"].space.text_encoder == words.space.text_encoder
     assert len(words.trained or ()) == TRAINED[name]
-    assert (words.is_trained("chairs"), words.is_trained("zebra")) == (True, False)
+    assert (words.is_trained("mugs"), words.is_trained("zebra")) == (True, False)
     # `rooms` was trained in several runs, of which the last one ends the stages.
     asked, done = made_by["settings"]["train"]["steps"], made_by["steps"]
     assert made_by["stages"][-1].startswith(f"{done} steps") and done <= asked if "stages" in made_by else done == asked

@@ -260,6 +260,8 @@ def name_evidence(
         restored: coordinates in the basis, or vectors, of Gaussians.
         regions: from `scene_regions`.
     """
+    from scipy.special import entr
+
     vectors = np.unique(names, axis=0)
     codes = outputs.project(vectors)
     odds, name = np.empty(len(restored), np.float32), np.empty(len(restored), np.int64)
@@ -273,11 +275,10 @@ def name_evidence(
     counts = np.maximum(np.bincount(regions), 1)
     tally = np.bincount(regions * len(vectors) + name, minlength=len(counts) * len(vectors))
     shares = tally.reshape(len(counts), -1) / counts[:, None]
-    entropy = -(shares * np.log(np.maximum(shares, 1e-12))).sum(axis=1)
     of_regions = np.stack(
         [
             np.bincount(regions, odds) / counts,
-            np.minimum(entropy, MANY_NAMES),
+            np.minimum(entr(shares).sum(axis=1), MANY_NAMES),
             np.minimum(np.log10(counts), MANY_GAUSSIANS),
         ],
         axis=1,
