@@ -41,7 +41,7 @@ def main() -> None:
     means, lows, seconds = ({name: list[float]() for name in encoders} for _ in range(3))
     for scene in chosen.scenes:
         gaussians = with_gaussians(load_scene(scene)).gaussians
-        found = {name: encoder.encode(gaussians, config, space=space) for name, encoder in encoders.items()}
+        features = {name: encoder.encode(gaussians, config, space=space) for name, encoder in encoders.items()}
         best = dict.fromkeys(encoders, np.inf)
         for _ in range(PASSES):
             for name, encoder in encoders.items():
@@ -49,7 +49,7 @@ def main() -> None:
                 encoder.encode(gaussians, config, space=space)
                 best[name] = min(best[name], time.perf_counter() - start)
         for name in encoders:
-            near = cosines(found[name], found[chosen.models[0]])
+            near = cosines(features[name], features[chosen.models[0]])
             means[name].append(float(near.mean()))
             lows[name].append(float(np.quantile(near, 0.01)))
             seconds[name].append(best[name] / best[chosen.models[0]])

@@ -13,9 +13,8 @@ from gsencoder.infer.relevancy import CHUNK_BYTES, feature_axes, word_directions
 from gsencoder.types import FeatureSpace, GaussianFeatures
 
 BIAS = 0.3
-"""By how much an encoder's cosines are smaller than those of fused features: means of 0.53 for its right boxes, and of
-0.8 for a segmenter's classes. In a real kitchen either alone names 0.51 and 0.44, and both together 0.60 with it, 0.50
-without it."""
+"""By how much an encoder's largest cosines are smaller than a segmenter's: 0.42 to 0.74 over the regions of a real
+kitchen, for 0.64 to 0.83. Alone they name 0.51 and 0.44 of it, together 0.60, and 0.50 without the bias."""
 
 
 def surer_features(
