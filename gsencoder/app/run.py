@@ -381,16 +381,18 @@ class ScenesFailedError(InputError):
         self.reasons = reasons
 
 
-def is_finished(target: Path, run: Run) -> bool:
-    """Whether a folder holds the results of this command with these settings; an InputError if it holds others."""
+def is_finished(target: Path, run: Run, **results: Any) -> bool:
+    """Whether a folder holds the results of this command with these settings, and with these `results` where they are
+    known before; an InputError if it holds others."""
     try:
         record = json.loads(read_foreign_text(target / SUMMARY_NAME))
     except FileNotFoundError:
         return False
     except (OSError, ValueError) as error:
         raise InputError(f"{target / SUMMARY_NAME}: cannot be read ({type(error).__name__})") from error
-    now = {"command": run.command, **_compared(json.loads(json.dumps(plain(run.settings))))}
+    now = {"command": run.command, **_compared(json.loads(json.dumps(plain(run.settings)))), **results}
     before = {"command": record.get("command"), **_compared(record.get("settings", {}))}
+    before |= {key: record.get("results", {}).get(key) for key in results}
     differing = sorted(key for key in {*now, *before} if now.get(key) != before.get(key))
     if differing:
         raise InputError(

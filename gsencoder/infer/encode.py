@@ -167,9 +167,9 @@ class Encoder:
         values: dict[str, Float32[np.ndarray, "N _channels"]] = {
             teacher: np.zeros((len(gaussians), part.stop - part.start), np.float32) for teacher, part in columns.items()
         }
-        for grid in grids:
+        for number, grid in enumerate(grids):
             bad = 0
-            for rows, features in self._on_grid(gaussians, grid, config, track):
+            for rows, features in self._on_grid(gaussians, grid, config, track, warn=not number):
                 bad += int((~np.isfinite(features).all(axis=1)).sum())
                 for teacher, part in columns.items():
                     values[teacher][rows] += features[:, part]
@@ -184,7 +184,7 @@ class Encoder:
         }
 
     def _on_grid(
-        self, gaussians: Gaussians, voxel: float, config: EncodeConfig, track: Track
+        self, gaussians: Gaussians, voxel: float, config: EncodeConfig, track: Track, *, warn: bool
     ) -> Iterator[tuple[Int64[np.ndarray, " n"], Float32[np.ndarray, "n channels"]]]:
         """Rows and their restored outputs, chunk by chunk. Each region is a scene of its own: its features do not
         depend on what else the splat holds."""
@@ -192,7 +192,8 @@ class Encoder:
         run = self.network.runner(config.precision, config.device, voxel)
         regions = scene_regions(gaussians.means, voxel)
         chunks = list(track(_cut_regions(gaussians.means, regions, config.chunk, config.halo), "cutting into chunks"))
-        _warn_of_work(chunks, len(gaussians), config)
+        if warn:
+            _warn_of_work(chunks, len(gaussians), config)
         # Attention follows the curve of the complete region, wherever it is cut.
         curves = {
             region: cut_scene_curves(

@@ -379,8 +379,9 @@ def expected_share(features: GaussianFeatures, scene: str) -> float | None:
     if share < KNOWN:
         warnings.warn(
             f"scene {scene}: the encoder expects {share:.0%} of its names in this scene to be right, fewer than half: "
-            "it looks like nothing that the encoder was trained on; `gsencoder fuse` on the splat asks a segmenter, "
-            "which looks at renders or photographs of it",
+            "it looks like nothing that the encoder was trained on, unless another direction is up (data.up=) or its "
+            "unit is another (data.metres_per_unit=); `gsencoder fuse` on the splat asks a segmenter, which looks at "
+            "renders or photographs of it",
             SceneWarning,
             stacklevel=3,
         )

@@ -125,8 +125,8 @@ class LabelsTeacher:
         if missing:
             raise InputError(
                 f"teacher labels: {len(missing)} object names are not among the {len(words)} words of {text_encoder}, "
-                f"first {missing[0]!r}; change them or set them to null in objects.json, or give a table that has them "
-                "(teacher.words=)"
+                f"first {missing[0]!r}; give text=minilm, which encodes any name, or a table that has them "
+                "(teacher.words=), or set them to null in objects.json"
             )
         mean = words.mean.astype(np.float64)
         other = (mean / np.sqrt((mean * mean).sum() + 1e-24)).astype(np.float32)

@@ -70,7 +70,7 @@ class RoomsConfig(CheckedConfig):
     libraries: tuple[str, ...] = option(
         (), "furniture libraries (.sh3f) for rooms that are made while the training runs; empty = no such rooms"
     )
-    share: float = option(0.75, "share of the samples that is from these rooms where scenes are given, too", gt=0, le=1)
+    share: float = option(0.75, "share of the samples that is from these rooms; the others are from SCENES", gt=0, le=1)
     samples: int = option(128, "number of samples from each room", ge=1, le=1_000_000)
     without: tuple[str, ...] = option(
         (), "kinds that no room has, to judge an encoder on kinds that it never saw", names=True
@@ -83,6 +83,8 @@ class RoomsConfig(CheckedConfig):
         unknown = [name for name in self.without if name not in kinds()]
         if unknown:
             raise InputError(f"rooms.without={unknown[0]}: no such kind; the kinds are {listed(list(kinds()), 8)}")
+        if self.without and not self.libraries:
+            raise InputError("rooms.without: expected rooms.libraries= with it; things of SCENES keep their names")
 
 
 def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras) -> Bool[np.ndarray, " N"]:

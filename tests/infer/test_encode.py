@@ -193,7 +193,7 @@ def test_chunks_that_take_many_times_the_work_of_a_scene_are_warned_of_with_thei
     )
     figures += "room for a halo of 0.25 m.*larger encode.chunk="
     with pytest.warns(SceneWarning, match=figures) as caught:
-        seen_by(one, EncodeConfig(chunk=200, halo=0.25), 0.5)
+        seen_by(one, EncodeConfig(chunk=200, halo=0.25, grids=(0.02, 0.04)), 0.5)
     assert len(caught) == 1
 
 

@@ -169,6 +169,8 @@ def test_kinds_may_be_left_out_whole_and_misspelled_ones_are_named(library: Path
     assert set(teacher.names) == {"other", *kinds()} - {"couch", "bed"}
     with pytest.raises(InputError, match=r"rooms\.without=cauch: no such kind; the kinds are"):
         RoomsConfig(without=("cauch",))
+    with pytest.raises(InputError, match=r"rooms\.without: expected rooms\.libraries= with it"):
+        RoomsConfig(without=("couch",))
 
 
 def test_made_rooms_need_a_teacher_of_labels(library: Path) -> None:

@@ -91,6 +91,8 @@ def run(config: EncodeCommandConfig, run: Run) -> None:
                     scene = with_gaussians(scene, config.seeds, track=run.track)
             scene, up = with_up(scene)
             run.report_up(scene.name, up)
+            if up is None:
+                run.print(f"up of {scene.name}: not known, and taken to be z (data.up= states it)")
             assert scene.gaussians is not None
             count, chunk = len(scene.gaussians), config.encode.chunk
             if chunk and count > chunk:

@@ -130,6 +130,11 @@ def run(config: FuseCommandConfig, run: Run) -> None:
             with run.step("teacher"):
                 chosen = choose_teacher(config.teacher, config.text, scene, words_once)
                 teacher = chosen.teacher.build(scene, chosen.words)
+            if config.encoder and chosen.teacher.needs_labels:
+                raise InputError(
+                    f"encoder: the labels of {path} are exact, and an encoder's names are not; leave encoder= out, or "
+                    "give teacher=mosaic text=minilm, a segmenter"
+                )
             if chosen.reason:
                 run.results.update(teacher=settings(chosen.teacher), text=settings(chosen.text))
                 run.print(f"{scene.name}: {chosen.reason}; {chosen.describe()}")
@@ -187,6 +192,7 @@ def run(config: FuseCommandConfig, run: Run) -> None:
 def with_encoder(fusion: Fusion, encoder: "Encoder", scene: Scene, run: Run) -> tuple[Fusion, TextTable]:
     """The fusion with the encoder's features where they are surer, and the encoder's words."""
     from gsencoder.infer.ensemble import surer_features
+    from gsencoder.infer.relevancy import expected_share
 
     assert scene.gaussians is not None
     text_encoder = fusion.features.space.text_encoder
@@ -201,7 +207,7 @@ def with_encoder(fusion: Fusion, encoder: "Encoder", scene: Scene, run: Run) -> 
     features, by_encoder = surer_features(
         fusion.features, encoded, words.encode(words.trained or words.names), words.mean
     )
-    run.results["by_encoder"] = float(by_encoder.mean())
+    run.results.update(by_encoder=float(by_encoder.mean()), expected_share=expected_share(encoded, scene.name))
     # Which words the encoder was trained on says nothing of the Gaussians that the teacher names.
     return replace(fusion, features=features), replace(words, trained=None)
 

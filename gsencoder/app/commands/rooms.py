@@ -1,6 +1,7 @@
 """`gsencoder rooms LIBRARY… out=FOLDER`: make furnished rooms with photographs, depth and labels from libraries of
 models, to train and to test encoders."""
 
+import hashlib
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -42,12 +43,13 @@ def run(config: RoomsConfig, run: Run) -> None:
     """Makes each home, one folder of OUT each; those that are finished stay, and processes share the rest."""
     with run.step("libraries"):
         models = select_makes(load_libraries(config.paths), config.makes)
+        digest = hashlib.sha256("\n".join(model.id for model in models).encode()).hexdigest()
     finished = busy = things = 0
     for seed in run.track(range(config.seed, config.seed + config.count), "homes"):
         one = Run(run.command, replace(config, seed=seed, count=1))
         target = run.out("rooms") / f"home_{seed:06d}"
         try:
-            if not config.overwrite and is_finished(target, one):
+            if not config.overwrite and is_finished(target, one, models=digest):
                 finished += 1
                 continue
             with one.folder(target) as folder:
@@ -57,7 +59,7 @@ def run(config: RoomsConfig, run: Run) -> None:
                     scene = furnished_scene(home, target.name, config.walk, np.random.default_rng([seed, 1]))
                 with one.step("write"):
                     write_room(scene, folder)
-                one.results.update(rooms=[room for room, _, _ in home.rooms], objects=len(scene.objects))
+                one.results.update(rooms=[room for room, _, _ in home.rooms], objects=len(scene.objects), models=digest)
                 things += len(scene.objects)
         except BusyError:
             busy += 1

@@ -24,7 +24,7 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 from PIL import Image
 
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.errors import InputError, SceneWarning, error_prefix, listed, readable
+from gsencoder.core.errors import InputError, SceneWarning, counted, error_prefix, listed, readable
 from gsencoder.data.furnished.kinds import Kind, kind_of
 
 CATALOGUE = "PluginFurnitureCatalog.properties"
@@ -108,16 +108,18 @@ class LibraryModel(Model):
 
 def load_libraries(paths: Sequence[str | Path]) -> tuple[Model, ...]:
     """Reads the catalogues of libraries, given as `.sh3f` files or folders of such. Models of kinds that rooms do not
-    have are left out; warns of libraries in which no kind is known, such as those with names in another language."""
+    have are left out; warns of libraries in which few names are known, such as those in another language."""
     files = [file for path in paths for file in _library_files(Path(path))]
     models: dict[str, LibraryModel] = {}
     for file in files:
         found, indoors = _read_catalogue(file)
-        if indoors and not found:
+        if len(found) < indoors / 2:
             warnings.warn(
-                f"{file}: none of its models has a name that is known; names are expected in English", SceneWarning,
+                f"{file}: of its {counted(indoors, 'model')}, {len(found)} have a name that is known, and the others "
+                "are left out; names are expected in English",
+                SceneWarning,
                 stacklevel=2,
-            )  # fmt: skip
+            )
         for model in found:
             if model.id in models:
                 raise InputError(
@@ -160,7 +162,10 @@ def _read_catalogue(file: Path) -> tuple[list[LibraryModel], int]:
         models = [model for number, row in sorted(rows.items()) if (model := _model_of(file, number, row))]
         typical = float(np.median([max(model.size) for model in models])) if models else USUAL_SIZE[0]
         if not USUAL_SIZE[0] <= typical <= USUAL_SIZE[1]:
-            raise InputError(f"half of its models are longer than {typical:.3g} m; expected sizes in centimetres")
+            raise InputError(
+                f"the median length of its models is {100 * typical:.3g} cm; expected sizes in centimetres, not in "
+                f"{'metres' if typical < USUAL_SIZE[0] else 'millimetres'}"
+            )
         return models, indoors
 
 
@@ -201,6 +206,9 @@ def _metres(row: dict[str, str], key: str) -> float:
         raise InputError(f"expected a number of centimetres as its {key}, got {row.get(key, 'none')!r}") from None
 
 
+_DAMAGES = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)
+
+
 @contextmanager
 def _opened(file: Path) -> Iterator[zipfile.ZipFile]:
     """A library that is open in the block."""
@@ -209,7 +217,7 @@ def _opened(file: Path) -> Iterator[zipfile.ZipFile]:
             yield archive
     except InputError:
         raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
+    except _DAMAGES as error:
         raise InputError(f"expected a zip archive, got a damaged one ({error})") from error
 
 
@@ -224,13 +232,19 @@ def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 class _Members(Mapping[str, bytes]):
-    """The files of an archive by name, of which those asked for are read."""
+    """The files of an archive by name, of which those asked for are read. `failure` is the first damaged one, without
+    which trimesh would go on; materials and pictures that are missing are so in many libraries."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive, self._names = archive, dict.fromkeys(archive.namelist())
+        self.failure: InputError | None = None
 
     def __getitem__(self, name: str) -> bytes:
-        return self._archive.read(name)
+        try:
+            return self._archive.read(name)
+        except _DAMAGES as error:
+            self.failure = self.failure or InputError(f"{name}: cannot be read ({error})")
+            raise
 
     def __contains__(self, name: object) -> bool:
         return name in self._names
@@ -252,11 +266,14 @@ def _read_mesh(file: Path, name: str) -> Mesh:
     with _opened(file) as archive, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         content = _read_member(archive, name)
-        resolver = trimesh.resolvers.ZipResolver(_Members(archive), namespace=str(Path(name).parent))
+        members = _Members(archive)
+        resolver = trimesh.resolvers.ZipResolver(members, namespace=str(Path(name).parent))
         try:
             scene = trimesh.load(io.BytesIO(content), file_type="obj", resolver=resolver, process=False, force="scene")
         except Exception as error:
             raise InputError(f"{name}: expected an OBJ file ({type(error).__name__}: {error})") from error
+    if members.failure:
+        raise members.failure
     parts = [each for each in scene.dump() if isinstance(each, trimesh.Trimesh) and len(each.faces)]
     if not parts:
         raise InputError(f"{name}: has no faces")

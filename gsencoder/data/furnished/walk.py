@@ -34,7 +34,7 @@ _TILT = 0.25
 class WalkConfig(CheckedConfig):
     """Settings of the walk and of the sensor."""
 
-    views: int = option(24, "number of views of a home", ge=1, le=10_000)
+    views: int = option(24, "number of views of a home; a room has three at least", ge=1, le=10_000)
     width: int = option(320, "width of the views in pixels; the height is three quarters of it", ge=16, le=8192)
     noise: float = option(1.0, "noise of the depth sensor, as a multiple of a structured-light camera's", ge=0, le=100)
     drift: float = option(0.01, "largest error of a pose, metres; poses drift along the walk", ge=0, le=1)

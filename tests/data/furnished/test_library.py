@@ -141,12 +141,13 @@ def test_wrong_values_of_a_catalogue_are_named(more: dict[str, str], message: st
         load_libraries([path])
 
 
-@pytest.mark.parametrize("unit", [0.01, 10.0], ids=["metres", "millimetres"])
-def test_sizes_in_another_unit_are_told_from_centimetres(unit: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("unit", "name"), [(0.01, "metres"), (10.0, "millimetres")])
+def test_sizes_in_another_unit_are_told_from_centimetres(unit: float, name: str, tmp_path: Path) -> None:
     sizes = {"Chair": (50.0, 50.0, 90.0), "Table": (120.0, 80.0, 75.0), "Mug": (9.0, 9.0, 11.0)}
-    rows = [(name, "Office", tuple(unit * side for side in size), {}) for name, size in sizes.items()]
+    rows = [(each, "Office", tuple(unit * side for side in size), {}) for each, size in sizes.items()]
     path = write_library(tmp_path / "test.sh3f", catalogue(rows))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"test.sh3f: half of its models are longer than .* sizes in centimetres"):
+    median = rf"test.sh3f: the median length of its models is {unit * 90:g} cm; .* in centimetres, not in {name}$"
+    with pytest.raises(InputError, match=median):
         load_libraries([path])
 
 
@@ -160,14 +161,24 @@ def test_an_incomplete_library_and_a_model_without_faces_are_named(tmp_path: Pat
 
 
 @pytest.mark.parametrize("bit", range(8))
-def test_a_flipped_bit_of_a_model_is_named(bit: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        ("box/box.obj", "expected a zip archive, got a damaged one"),
+        ("box/box.mtl", "box/box.mtl: cannot be read"),
+        ("box/back.png", "box/back.png: cannot be read"),
+    ],
+)
+def test_a_flipped_bit_of_a_model_its_materials_or_pictures_is_named(
+    file: str, message: str, bit: int, tmp_path: Path
+) -> None:
     path = write_library(tmp_path / "flipped.sh3f")
     with zipfile.ZipFile(path) as archive:
-        member = archive.getinfo("box/box.obj")
+        member = archive.getinfo(file)
     content = bytearray(path.read_bytes())
     content[member.header_offset + 30 + len(member.filename) + member.compress_size // 3] ^= 1 << bit
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"model test#1: expected a zip archive, got a damaged one"):
+    with pytest.raises(InputError, match=f"model test#1: {message}"):
         load_libraries([path])[0].mesh  # noqa: B018
 
 
@@ -190,8 +201,13 @@ def test_a_flipped_bit_of_the_directory_of_an_archive_is_an_error_of_the_input_o
 def test_names_in_another_language_are_warned_of(tmp_path: Path) -> None:
     known = write_library(tmp_path / "known.sh3f")
     foreign = write_library(tmp_path / "stuhl.sh3f", catalogue([("Stuhl", "Wohnzimmer", (50, 50, 90), {})]))
-    with pytest.warns(SceneWarning, match=r"stuhl.sh3f: none of its models has a name that is known"):
+    with pytest.warns(SceneWarning, match=r"stuhl.sh3f: of its 1 model, 0 have a name that is known"):
         load_libraries([known, foreign])
+    size = (50.0, 50.0, 90.0)
+    rows = [(name, "Wohnzimmer", size, {"id": name}) for name in ("Laptop", "Stuhl", "Tisch")]
+    mostly = write_library(tmp_path / "laptop.sh3f", catalogue(rows))
+    with pytest.warns(SceneWarning, match=r"laptop.sh3f: of its 3 models, 1 have a name that is known"):
+        assert [model.name for model in load_libraries([mostly])] == ["Laptop"]
     with pytest.raises(InputError, match="no model of a known kind"), pytest.warns(SceneWarning):
         load_libraries([foreign])
 

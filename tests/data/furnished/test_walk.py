@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from furniture import write_library
+from command_runs import refusal
+from furniture import MODELS, catalogue, write_library
 
 from gsencoder.app import main as cli
 from gsencoder.data.furnished import surfaces
@@ -108,6 +110,16 @@ def test_the_command_takes_the_makes_and_the_types_that_it_is_told(models, tmp_p
     ((used, _, types),) = given
     assert [model.id for model in used] == [model.id for model in select_makes(models, "held_out")]
     assert types == ("bathroom",)
+
+
+def test_homes_of_another_library_do_not_join_those_that_are_finished(tmp_path: Path, capsys) -> None:
+    whole = write_library(tmp_path / "whole.sh3f")
+    fewer = write_library(tmp_path / "fewer.sh3f", catalogue([each for each in MODELS if each[0] != "Cup"]))
+    options = ("types=[bathroom]", "walk.views=3", "walk.width=32", f"out={tmp_path / 'homes'}")
+    assert cli.main(["rooms", str(whole), *options, "quiet=true"]) == 0
+    moved = whole.rename(tmp_path / "moved.sh3f")
+    assert cli.main(["rooms", str(moved), *options, "count=2", "quiet=true"]) == 0
+    assert "holds the results of other settings (models)" in refusal(capsys, "rooms", str(fewer), *options)
 
 
 def test_noise_grows_with_the_square_of_depth_and_drift_moves_poses(home: Home) -> None:
