@@ -133,6 +133,32 @@ def test_every_sign_of_a_room_with_walls_is_needed(change, is_room):
     assert replace(walls, **change).is_room == is_room
 
 
+@pytest.mark.parametrize(
+    ("change", "is_room"),
+    [
+        ({}, True),
+        ({"adjacent": 0.64}, False),
+        ({"space": 0.57}, False),
+        ({"openness": 0.23}, False),
+        ({"content": 0.024}, False),
+        ({"enough": False}, False),
+    ],
+)
+def test_a_room_whose_free_space_is_most_of_it_may_be_as_high_as_it_is_wide(change, is_room):
+    bathroom = Enclosure(flatness=0.97, openness=0.36, space=0.8, adjacent=0.8, content=0.05)
+    assert replace(bathroom, **change).is_room == is_room
+
+
+def test_a_bathroom_with_a_ceiling_is_a_room_and_the_same_box_without_its_furniture_is_none():
+    high = np.array([2.2, 2.0, 2.3])
+    box = sides(np.zeros(3), high, 0.04)
+    things = [((0.05, 0.05, 0), (0.75, 1.7, 0.55)), ((1.5, 0.1, 0), (2.0, 0.6, 0.85)), ((1.5, 1.3, 0), (1.9, 1.9, 0.8))]
+    assert not enclosure_of(splat(box)).is_room
+    assert enclosure_of(
+        splat([*box, *(row for low, up in things for row in sides(np.array(low), np.array(up), 0.04))])
+    ).is_room
+
+
 def test_few_gaussians_show_no_room():
     gaussians = room()
     few = gaussians.select(np.linspace(0, len(gaussians) - 1, MIN_GAUSSIANS - 1).astype(int))
