@@ -43,6 +43,10 @@ NEAR_USUAL_WEIGHT = 2.0
 """Factor of the floor of an axis of a bare splat within `MAX_TILT` of -y. In rooms the true floor has more than three
 times the area of the largest wall at an end; where hardly any floor was photographed, this decides."""
 
+LOW_WEIGHT, BETWEEN = 0.3, 0.44
+"""Weight of what lies low beside the floor's area, and half of the part of the extent in which it is looked at, without
+floor and ceiling. Of 56 made rooms and homes of which z is up, 0.62 come out right without and 0.82 with it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Up:
@@ -207,7 +211,8 @@ def _upright_axis(
     normals: Float64[np.ndarray, "n 3"],
     areas: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "3"]:
-    """Of the axes of a Manhattan world, both ways, the one with the largest floor; see `NEAR_USUAL_WEIGHT`."""
+    """Of the axes of a Manhattan world, both ways, the one with the largest floor and things that stand on it; see
+    `NEAR_USUAL_WEIGHT`."""
     across = np.linalg.svd(direction[None])[2][1:]
     turns = np.deg2rad(np.arange(0, 90, 3.0))
     circle = np.cos(turns)[:, None] * across[0] + np.sin(turns)[:, None] * across[1]
@@ -215,11 +220,12 @@ def _upright_axis(
     third = np.cross(direction, second)
     axes = [sign * axis for axis in (direction, second, third / np.linalg.norm(third)) for sign in (1.0, -1.0)]
 
-    def weighted_floor(axis: Float64[np.ndarray, "3"]) -> float:
+    def support(axis: Float64[np.ndarray, "3"]) -> float:
         area = _floor_area(axis, means, normals, areas)
-        return area * NEAR_USUAL_WEIGHT if area > 0 and -axis[1] >= np.cos(MAX_TILT) else area
+        weighted = area * NEAR_USUAL_WEIGHT if area > 0 and -axis[1] >= np.cos(MAX_TILT) else area
+        return weighted + LOW_WEIGHT * _lowness(axis, means, normals, areas)
 
-    return max(axes, key=weighted_floor)
+    return max(axes, key=support)
 
 
 def _floor_area(
@@ -239,6 +245,24 @@ def _floor_area(
     area = np.bincount(slices.clip(0, count), lying, count + 1)
     fifth = count // 5
     return float(area[:fifth].max() - 0.5 * area[-fifth:].max())
+
+
+def _lowness(
+    up: Float64[np.ndarray, "3"],
+    means: Float64[np.ndarray, "n 3"],
+    normals: Float64[np.ndarray, "n 3"],
+    areas: Float64[np.ndarray, " n"],
+) -> float:
+    """How far below the middle of the scene lies what is between its ends: all of it, and that of it which lies, each
+    from −½ to ½ of the extent. Things stand on floors."""
+    heights = means @ up
+    low, high = np.quantile(heights, (0.01, 0.99))
+    between = np.abs(heights - (low + high) / 2) < BETWEEN * (high - low)
+    if not between.any():
+        return 0.0
+    relative = (heights[between] - low) / (high - low)
+    lying = _bells(normals[between] @ up)[0] * areas[between]
+    return float(sum(0.5 - relative @ each / max(each.sum(), 1e-12) for each in (areas[between], lying)))
 
 
 FLOOR_QUANTILE = 0.01

@@ -17,7 +17,7 @@ from gsencoder.data.enclosure import (
     surfaces_of_gaussians,
 )
 from gsencoder.data.seeding.points import flat_gaussians
-from gsencoder.data.up import with_up
+from gsencoder.data.up import turn, with_up
 from gsencoder.fusion.cameras import with_views
 from gsencoder.types import Gaussians, Scene, Views
 
@@ -149,14 +149,25 @@ def test_a_room_whose_free_space_is_most_of_it_may_be_as_high_as_it_is_wide(chan
     assert replace(bathroom, **change).is_room == is_room
 
 
-def test_a_bathroom_with_a_ceiling_is_a_room_and_the_same_box_without_its_furniture_is_none():
-    high = np.array([2.2, 2.0, 2.3])
-    box = sides(np.zeros(3), high, 0.04)
+def bathroom() -> list[np.ndarray]:
+    """Floor, walls and ceiling, about as high as wide, and three things on the floor."""
     things = [((0.05, 0.05, 0), (0.75, 1.7, 0.55)), ((1.5, 0.1, 0), (2.0, 0.6, 0.85)), ((1.5, 1.3, 0), (1.9, 1.9, 0.8))]
-    assert not enclosure_of(splat(box)).is_room
-    assert enclosure_of(
-        splat([*box, *(row for low, up in things for row in sides(np.array(low), np.array(up), 0.04))])
-    ).is_room
+    rows = sides(np.zeros(3), np.array([2.2, 2.0, 2.3]), 0.04)
+    for low, high in things:
+        rows += sides(np.array(low), np.array(high), 0.04)
+    return rows
+
+
+def test_a_bathroom_with_a_ceiling_is_a_room_and_the_same_without_its_furniture_is_none():
+    assert enclosure_of(splat(bathroom())).is_room
+    assert not enclosure_of(splat(bathroom()[:6])).is_room
+
+
+@pytest.mark.parametrize("up", [(0, -1, 0), (0, 1, 0)])
+def test_what_stands_on_the_floor_tells_it_from_a_ceiling_that_is_as_large(up):
+    to_from = Rotation.align_vectors([up], [[0, 0, 1]])[0].as_matrix()
+    scene = Scene(name="bathroom", gaussians=turn(splat(bathroom()), to_from, 1.0))
+    assert with_up(scene)[1].direction @ up > 0.99
 
 
 def test_few_gaussians_show_no_room():
