@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.enclosure import (
+    FLAT,
     Surfaces,
     enclosure_of,
     planes_of_gaussians,
@@ -219,11 +220,14 @@ def _upright_axis(
     second = _refine(circle[_support(circle, normals, areas).argmax()], normals, areas)
     third = np.cross(direction, second)
     axes = [sign * axis for axis in (direction, second, third / np.linalg.norm(third)) for sign in (1.0, -1.0)]
+    sides = [float(np.ptp(np.quantile(means @ axis, (0.01, 0.99)))) for axis in axes[::2]]
+    # Of what is flat, such as land or a large home, the floor says enough, and things lie to one side by chance.
+    low_weight = LOW_WEIGHT if min(sides) > FLAT * max(sides) else 0.0
 
     def support(axis: Float64[np.ndarray, "3"]) -> float:
         area = _floor_area(axis, means, normals, areas)
         weighted = area * NEAR_USUAL_WEIGHT if area > 0 and -axis[1] >= np.cos(MAX_TILT) else area
-        return weighted + LOW_WEIGHT * _lowness(axis, means, normals, areas)
+        return weighted + low_weight * _lowness(axis, means, normals, areas)
 
     return max(axes, key=support)
 
