@@ -492,3 +492,12 @@ def test_an_upright_splat_has_its_floor_at_zero_whichever_way_up_was(up: tuple[f
     )
     lengths = np.einsum("i,nij,j->n", axis, before, axis)
     np.testing.assert_allclose(after[:, 2, 2], lengths, rtol=1e-3, atol=1e-6)
+
+
+def test_of_flat_land_the_ground_says_what_is_up_and_not_the_side_on_which_houses_stand():
+    rng = np.random.default_rng(0)
+    ground = rng.uniform([0, 0, 0], [10, 10, 0.01], (1500, 3))
+    fronts = rng.uniform([0.7, 0, 0], [1.5, 10, 2], (8500, 3))
+    normals = np.repeat(np.eye(3)[[2, 0]], [1500, 8500], axis=0)
+    surfaces = Surfaces(np.concatenate([ground, fronts]), normals, np.ones(10_000), 0.0)
+    np.testing.assert_allclose(estimate_up(surfaces, None).direction, [0, 0, 1], atol=0.02)
