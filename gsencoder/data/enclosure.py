@@ -154,8 +154,8 @@ class Enclosure:
         """Whether photographs of it would be taken from inside."""
         if not self.enough or self.adjacent < OPEN_ADJACENT:
             return False
-        least = (WIDE_SPACE, WIDE_OPENNESS, WIDE_ADJACENT, WIDE_CONTENT)
-        if all(np.array([self.space, self.openness, self.adjacent, self.content]) >= least):
+        wide = self.space >= WIDE_SPACE and self.openness >= WIDE_OPENNESS
+        if wide and self.adjacent >= WIDE_ADJACENT and self.content >= WIDE_CONTENT:
             return True
         if self.flatness > HIGH:
             return False

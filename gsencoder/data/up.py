@@ -232,6 +232,15 @@ def _upright_axis(
     return max(axes, key=support)
 
 
+def _relative_heights(
+    up: Float64[np.ndarray, "3"], means: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, " n"] | None:
+    """Heights from 0 at the lower end of the scene to 1 at its upper one; None where all are the same."""
+    heights = means @ up
+    low, high = np.quantile(heights, (0.01, 0.99))
+    return (heights - low) / (high - low) if high > low else None
+
+
 def _floor_area(
     up: Float64[np.ndarray, "3"],
     means: Float64[np.ndarray, "n 3"],
@@ -239,12 +248,11 @@ def _floor_area(
     areas: Float64[np.ndarray, " n"],
 ) -> float:
     """The area that lies in the fullest slice of the lowest fifth of the scene, less that in its highest fifth / 2."""
-    heights = means @ up
-    low, high = np.quantile(heights, (0.01, 0.99))
-    if high <= low:
+    heights = _relative_heights(up, means)
+    if heights is None:
         return 0.0
     lying = _bells(normals @ up)[0] * areas
-    slices = ((heights - low) / (high - low) / FLOOR_THICKNESS).astype(np.int64)
+    slices = (heights / FLOOR_THICKNESS).astype(np.int64)
     count = round(1 / FLOOR_THICKNESS)
     area = np.bincount(slices.clip(0, count), lying, count + 1)
     fifth = count // 5
@@ -258,15 +266,14 @@ def _lowness(
     areas: Float64[np.ndarray, " n"],
 ) -> float:
     """How far below the middle of the scene lies what is between its ends: all of it, and that of it which lies, each
-    from −½ to ½ of the extent. Things stand on floors."""
-    heights = means @ up
-    low, high = np.quantile(heights, (0.01, 0.99))
-    between = np.abs(heights - (low + high) / 2) < BETWEEN * (high - low)
-    if not between.any():
+    from −½ to ½ of the extent, 0 where there is none. Things stand on floors."""
+    heights = _relative_heights(up, means)
+    if heights is None:
         return 0.0
-    relative = (heights[between] - low) / (high - low)
+    between = np.abs(heights - 0.5) < BETWEEN
     lying = _bells(normals[between] @ up)[0] * areas[between]
-    return float(sum(0.5 - relative @ each / max(each.sum(), 1e-12) for each in (areas[between], lying)))
+    weights = [each for each in (areas[between], lying) if each.sum() > 1e-12]
+    return float(sum(0.5 - heights[between] @ each / each.sum() for each in weights))
 
 
 FLOOR_QUANTILE = 0.01

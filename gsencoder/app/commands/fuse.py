@@ -129,12 +129,12 @@ def run(config: FuseCommandConfig, run: Run) -> None:
             )
             with run.step("teacher"):
                 chosen = choose_teacher(config.teacher, config.text, scene, words_once)
+                if config.encoder and chosen.teacher.needs_labels:
+                    raise InputError(
+                        f"encoder: the labels of {path} are exact, and an encoder's names are not; leave encoder= out, "
+                        "or give teacher=mosaic text=minilm, a segmenter"
+                    )
                 teacher = chosen.teacher.build(scene, chosen.words)
-            if config.encoder and chosen.teacher.needs_labels:
-                raise InputError(
-                    f"encoder: the labels of {path} are exact, and an encoder's names are not; leave encoder= out, or "
-                    "give teacher=mosaic text=minilm, a segmenter"
-                )
             if chosen.reason:
                 run.results.update(teacher=settings(chosen.teacher), text=settings(chosen.text))
                 run.print(f"{scene.name}: {chosen.reason}; {chosen.describe()}")
